@@ -1,0 +1,1 @@
+"""Building blocks shared by the algorithms: replay, windows, extractors, saving."""

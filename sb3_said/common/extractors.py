@@ -1,0 +1,43 @@
+"""What an actor or a critic reads of a delayed observation."""
+
+from __future__ import annotations
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+
+from sb3_said.common.save_util import register_class
+
+
+@register_class
+class StateAugmentedExtractor(BaseFeaturesExtractor):
+    """Concatenate [delayed observation, action history, age / D], with which the process is Markov (paper, Theorem 2.1).
+
+    :param observation_space: that of ``DelayedObservationWrapper``
+    """
+
+    def __init__(self, observation_space: spaces.Dict):
+        history = observation_space["action_history"]
+        obs_dim, (max_delay, act_dim) = observation_space["observation"].shape[0], history.shape  # type: ignore
+        super().__init__(observation_space, features_dim=obs_dim + max_delay * act_dim + 1)
+        self.age_scale = 1.0 / max(max_delay, 1)
+
+    def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
+        history = observations["action_history"].flatten(1)  # (B, D * act_dim)
+        return th.cat([observations["observation"], history, observations["delay"] * self.age_scale], dim=1)
+
+
+@register_class
+class KeyExtractor(BaseFeaturesExtractor):
+    """Read one key of a dict observation and nothing else.
+
+    :param observation_space: with a 1-D Box under ``key``
+    :param key: e.g. ``"undelayed_observation"`` for a delay-reconciled critic
+    """
+
+    def __init__(self, observation_space: spaces.Dict, key: str):
+        super().__init__(observation_space, features_dim=observation_space[key].shape[0])  # type: ignore[index]
+        self.key = key
+
+    def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
+        return observations[self.key]

@@ -1,0 +1,110 @@
+"""Windows of consecutive (state, action) pairs, gathered by index from resident arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch as th
+
+
+class Windows(NamedTuple):
+    """A batch of B windows of L steps; row k holds s_k and a_k of one episode, in environment units.
+
+    Rows behind an episode's end repeat its last row and have ``valid`` False.
+    """
+
+    states: th.Tensor  # (B, L, obs_dim) float32
+    actions: th.Tensor  # (B, L, act_dim) float32, in [-1, 1]
+    valid: th.Tensor  # (B, L) bool; a prefix of each row, never empty
+    values: th.Tensor  # (B,) float32 in [0, 1], normalised value of the first state
+
+
+@dataclass(frozen=True)
+class WindowSource:
+    """Every place a window can start, over arrays that are shared and never copied.
+
+    The arrays are laid out as a replay buffer's: ``n_rows`` time steps of ``n_envs`` parallel environments, possibly
+    wrapped around. A plain dataset is the case ``n_envs=1``.
+
+    :param states: (n_rows, n_envs, obs_dim) float32 true states
+    :param actions: (n_rows, n_envs, act_dim) float32 in [-1, 1]
+    :param rows: (n_starts,) int64, the row of each possible start
+    :param envs: (n_starts,) int64, the environment of each possible start
+    :param remaining: (n_starts,) int64, stored steps from the start to its episode's end, both included, >= 1
+    :param values: (n_starts,) float32, normalised value of each start's state, in [0, 1]
+    :param episodes: (n_starts,) int64, a number for the episode each start belongs to
+    """
+
+    states: th.Tensor
+    actions: th.Tensor
+    rows: th.Tensor
+    envs: th.Tensor
+    remaining: th.Tensor
+    values: th.Tensor
+    episodes: th.Tensor
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @property
+    def obs_dim(self) -> int:
+        return self.states.shape[-1]
+
+    @property
+    def act_dim(self) -> int:
+        return self.actions.shape[-1]
+
+    def sample(self, batch_size: int, length: int, generator: th.Generator | None = None) -> Windows:
+        """Draw windows whose starts are uniform over all stored steps.
+
+        :param batch_size: B
+        :param length: L, steps of a window
+        :param generator: CPU generator; torch's global one by default
+        """
+        return self.gather(th.randint(len(self), (batch_size,), generator=generator), length)
+
+    def gather(self, starts: th.Tensor, length: int) -> Windows:
+        """Return the windows at given starts.
+
+        :param starts: (B,) int64, indices into ``rows``
+        :param length: L, steps of a window
+        """
+        steps = th.arange(length)  # (L,)
+        remaining = self.remaining[starts, None]  # (B, 1)
+        offset = th.minimum(steps, remaining - 1)  # (B, L): behind the end, the last row again
+        rows = (self.rows[starts, None] + offset) % len(self.states)  # (B, L)
+        envs = self.envs[starts, None]  # (B, 1)
+        return Windows(self.states[rows, envs], self.actions[rows, envs], steps < remaining, self.values[starts])
+
+    def split(self, held_out: float, seed: int = 0) -> tuple[WindowSource, WindowSource]:
+        """Split by whole episodes into a training and a held-out source.
+
+        Episodes are drawn at random until the held-out part has at least ``held_out`` of all starts.
+
+        :param held_out: fraction of the starts to hold out, in (0, 1)
+        :param seed: of the draw
+        :raises ValueError: when there are fewer than two episodes, so that one part would be empty
+        """
+        numbers, sizes = th.unique(self.episodes, return_counts=True)
+        if len(numbers) < 2:
+            raise ValueError(
+                "Holding out windows needs at least two episodes, but the data has "
+                f"{len(numbers)}; collect more episodes or train without held-out windows."
+            )
+        order = th.randperm(len(numbers), generator=th.Generator().manual_seed(seed))
+        n_held_out = int((sizes[order].cumsum(0) < held_out * len(self)).sum()) + 1
+        held = th.isin(self.episodes, numbers[order[: min(n_held_out, len(numbers) - 1)]])
+        return self._select(~held), self._select(held)
+
+    def start_states(self) -> th.Tensor:
+        """Return the state of every start: (n_starts, obs_dim)."""
+        return self.states[self.rows, self.envs]
+
+    def start_actions(self) -> th.Tensor:
+        """Return the action of every start: (n_starts, act_dim)."""
+        return self.actions[self.rows, self.envs]
+
+    def _select(self, keep: th.Tensor) -> WindowSource:
+        names = ("rows", "envs", "remaining", "values", "episodes")
+        return replace(self, **{name: getattr(self, name)[keep] for name in names})

@@ -1,0 +1,130 @@
+"""The delayed world: a Gymnasium wrapper that hands out old observations and the actions sent since."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from sb3_said.delays.processes import DelayProcess, make_process
+
+
+class DelayedObservationWrapper(
+    gym.Wrapper[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray], gym.utils.RecordConstructorArgs
+):
+    """Delay a task's observations by some control steps; rewards and episode ends stay undelayed.
+
+    The observation becomes a dict of float32 arrays:
+
+    - ``observation`` (obs_dim,): s_{t-age}, the newest observation that has arrived;
+    - ``action_history`` (D, act_dim): the D newest actions a_{t-D..t-1}, oldest first, scaled to [-1, 1] from the
+      bounds of the action space, zeros before the episode;
+    - ``delay`` (1,): the age of ``observation`` in control steps.
+
+    At reset s_0 arrives with age 0, and ages while it is all that has arrived, so an episode starts as a task with a
+    smaller delay. ``info["undelayed_observation"]`` is the true state after the step, for replay and diagnosis only.
+
+    ``gymnasium.wrappers.DelayObservation`` returns zeros before the first observation arrives, and neither the actions
+    sent since nor the age, without which the process is not Markov (paper, Theorem 2.1).
+
+    :param env: a task with a 1-D Box observation and a bounded Box action
+    :param delay: d >= 0 control steps; or ``(low, high)``, drawn uniformly at every reset; or a delay process
+    :param max_delay: D, length of the action history; the largest delay by default. A larger one serves a model that
+        was built for it.
+    :raises ValueError: for other spaces, a bad delay, or a ``max_delay`` below the largest delay
+
+    >>> env = DelayedObservationWrapper(gym.make("Pendulum-v1"), delay=2)
+    >>> obs, info = env.reset(seed=0)
+    >>> for _ in range(3):
+    ...     obs, reward, terminated, truncated, info = env.step(np.array([1.0], dtype=np.float32))
+    >>> obs["delay"], obs["action_history"].ravel()
+    (array([2.], dtype=float32), array([0.5, 0.5], dtype=float32))
+
+    Change logs:
+     * v0.1.0 - Initially added
+    """
+
+    def __init__(
+        self, env: gym.Env[Any, Any], delay: int | tuple[int, int] | DelayProcess = 4, *, max_delay: int | None = None
+    ):
+        gym.utils.RecordConstructorArgs.__init__(self, delay=delay, max_delay=max_delay)
+        gym.Wrapper.__init__(self, env)
+        obs_space, act_space = env.observation_space, env.action_space
+        if not (isinstance(obs_space, spaces.Box) and len(obs_space.shape) == 1):
+            raise ValueError(
+                f"DelayedObservationWrapper needs a 1-D Box observation, got {obs_space}; "
+                "put gymnasium.wrappers.FlattenObservation below it."
+            )
+        if not (isinstance(act_space, spaces.Box) and len(act_space.shape) == 1 and act_space.is_bounded()):
+            raise ValueError(
+                f"DelayedObservationWrapper needs a bounded 1-D Box action, got {act_space}; "
+                "put gymnasium.wrappers.RescaleAction below it."
+            )
+        self.process = make_process(delay)
+        self.max_delay = self.process.max_delay if max_delay is None else max_delay
+        if self.max_delay < self.process.max_delay:
+            raise ValueError(f"max_delay={max_delay} is smaller than the largest delay {self.process.max_delay}.")
+
+        self._action_low, self._action_span = act_space.low, act_space.high - act_space.low
+        self._action_is_scaled = bool(np.all(act_space.low == -1) and np.all(act_space.high == 1))
+        low, high = (bound.astype(np.float32) for bound in (obs_space.low, obs_space.high))
+        self.observation_space = spaces.Dict(
+            observation=spaces.Box(low, high, dtype=np.float32),
+            action_history=spaces.Box(-1.0, 1.0, (self.max_delay, *act_space.shape), np.float32),
+            delay=spaces.Box(0.0, float(self.max_delay), (1,), np.float32),
+        )
+        self._rng = np.random.default_rng()
+        self._delay = 0
+        self._age = 0
+        self._states: deque[np.ndarray] = deque(maxlen=self.max_delay + 1)
+        self._history = np.zeros((self.max_delay, *act_space.shape), np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Reset the task; s_0 arrives at once.
+
+        :param seed: seeds the task and the delay process
+        """
+        state, info = self.env.reset(seed=seed, options=options)
+        if seed is not None:
+            self._rng = np.random.default_rng(seed)
+        self._delay = self.process.sample(self._rng)
+        self._age = 0
+        self._states.clear()
+        self._history[:] = 0.0
+        return self._observe(state), self._with_state(info)
+
+    def step(
+        self, action: np.ndarray
+    ) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict[str, Any]]:
+        """Execute the action now; observe what has arrived.
+
+        :param action: (act_dim,), in the units of the action space
+        """
+        state, reward, terminated, truncated, info = self.env.step(action)
+        if self.max_delay > 0:
+            self._history[:-1] = self._history[1:]
+            self._history[-1] = self._scale(action)
+        self._age = min(self._age + 1, self._delay)
+        return self._observe(state), reward, terminated, truncated, self._with_state(info)
+
+    def _observe(self, state: np.ndarray) -> dict[str, np.ndarray]:
+        self._states.append(np.asarray(state, dtype=np.float32).copy())
+        return {
+            "observation": self._states[-1 - self._age].copy(),
+            "action_history": self._history.copy(),
+            "delay": np.array([self._age], dtype=np.float32),
+        }
+
+    def _with_state(self, info: dict[str, Any]) -> dict[str, Any]:
+        return {**info, "undelayed_observation": self._states[-1].copy()}
+
+    def _scale(self, action: np.ndarray) -> np.ndarray:
+        """Scale from the action space to [-1, 1]; bit for bit the same where it has these bounds already."""
+        if not self._action_is_scaled:
+            action = 2.0 * ((action - self._action_low) / self._action_span) - 1.0
+        return np.clip(action, -1.0, 1.0)
