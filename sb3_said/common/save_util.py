@@ -1,0 +1,453 @@
+"""Saving and loading of Stable-Baselines3 algorithms without pickle: a stranger's file cannot run code."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import pathlib
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterable
+from typing import Any, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common import buffers, noise, policies, torch_layers
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.save_util import load_from_zip_file, recursive_getattr, recursive_setattr
+from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
+from stable_baselines3.common.type_aliases import GymEnv, TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.utils import (
+    ConstantSchedule,
+    FloatSchedule,
+    LinearSchedule,
+    check_for_correct_spaces,
+    get_device,
+    get_system_info,
+)
+from stable_baselines3.dqn import policies as dqn_policies
+from stable_baselines3.her import GoalSelectionStrategy, HerReplayBuffer
+from stable_baselines3.sac import policies as sac_policies
+from stable_baselines3.td3 import policies as td3_policies
+from torch.nn.modules import activation
+
+from sb3_said.common.tree_file import (
+    Decoder,
+    Encoder,
+    PathOrFile,
+    PickleRefusedError,
+    SavedFileError,
+    load_metadata,
+    load_tree,
+    read_file,
+    readable,
+    save_tree,
+    torch_dtype,
+    write_file,
+)
+
+__all__ = [
+    "PickleRefusedError",
+    "SafeSaveMixin",
+    "SavedFileError",
+    "load_algorithm_file",
+    "load_metadata",
+    "load_tree",
+    "register_class",
+    "save_algorithm",
+    "save_tree",
+]
+
+ClassType = TypeVar("ClassType", bound=type)
+SelfSafeSave = TypeVar("SelfSafeSave", bound="SafeSaveMixin")
+
+# Files name classes, and these names are all that a file can name: nothing is ever imported because a file says so.
+_CLASS_OF_NAME: dict[str, type] = {}
+_NAME_OF_CLASS: dict[type, str] = {}
+
+
+def register_class(cls: ClassType, name: str | None = None) -> ClassType:
+    """Allow saved files to hold this class, and, if it is a dataclass, its instances. Usable as a decorator.
+
+    Needed for policies, features extractors and replay buffers of your own. The file keeps only the name: the module
+    that registers the class has to be imported before loading. Loading may call a registered class with arguments from
+    the file, so register none whose constructor does harm.
+
+    :param cls: the class
+    :param name: its name in files; by default module and qualified name. A class that moved can be registered a second
+        time under its old name, so that old files still load.
+    """
+    name = name or f"{cls.__module__}.{cls.__qualname__}"
+    _CLASS_OF_NAME[name] = cls
+    _NAME_OF_CLASS.setdefault(cls, name)
+    return cls
+
+
+def _register_libraries() -> None:
+    for name in activation.__all__:
+        register_class(getattr(activation, name), f"torch.nn.{name}")
+    register_class(th.nn.Identity, "torch.nn.Identity")
+    for value in vars(th.optim).values():
+        if isinstance(value, type) and issubclass(value, th.optim.Optimizer):
+            register_class(value, f"torch.optim.{value.__name__}")
+    register_class(RMSpropTFLike)
+    register_class(HerReplayBuffer)
+    kinds = (BasePolicy, buffers.BaseBuffer, torch_layers.BaseFeaturesExtractor)
+    for module in (policies, buffers, torch_layers, sac_policies, td3_policies, dqn_policies):
+        for value in vars(module).values():
+            if isinstance(value, type) and issubclass(value, kinds):
+                register_class(value)
+    for kind in (bool, int, float):
+        register_class(kind)
+    for name in ("bool", "int8", "int16", "int32", "int64", "uint8", "float16", "float32", "float64"):
+        register_class(np.dtype(name).type, f"numpy.{name}")
+
+
+_register_libraries()
+
+
+def _load_generator(state: Any) -> np.random.Generator:
+    # Only NumPy's default kind: the state of others holds positions in memory that NumPy does not check.
+    bit_generator = np.random.PCG64()
+    bit_generator.state = state
+    return np.random.Generator(bit_generator)
+
+
+# The constructor's arguments that rebuild an instance, by exact class: a subclass would come back as its parent.
+_ARGUMENTS: dict[type, Callable[[Any], dict[str, Any]]] = {
+    spaces.Box: lambda s: {"low": s.low, "high": s.high, "shape": s.shape, "dtype": s.dtype},
+    # Older versions of gymnasium know only int64, and take no dtype.
+    spaces.Discrete: lambda s: {"n": s.n, "start": s.start} | ({} if s.dtype == np.int64 else {"dtype": s.dtype}),
+    spaces.MultiBinary: lambda s: {"n": s.n},
+    spaces.MultiDiscrete: lambda s: {"nvec": s.nvec, "dtype": s.dtype, "start": s.start},
+    spaces.Tuple: lambda s: {"spaces": s.spaces},
+    # Pairs, because a dict would be sorted, and the order of the keys is the order of a network's inputs.
+    spaces.Dict: lambda s: {"spaces": list(s.spaces.items())},
+    FloatSchedule: lambda f: {"value_schedule": f.value_schedule},
+    ConstantSchedule: lambda f: {"val": f.val},
+    LinearSchedule: lambda f: {"start": f.start, "end": f.end, "end_fraction": f.end_fraction},
+    TrainFreq: lambda t: t._asdict(),
+    TrainFrequencyUnit: lambda e: {"value": e.value},
+    GoalSelectionStrategy: lambda e: {"value": e.value},
+    # The state of a noise process is left out: ``learn`` resets it.
+    noise.NormalActionNoise: lambda n: {"mean": n._mu, "sigma": n._sigma, "dtype": n._dtype},
+    noise.OrnsteinUhlenbeckActionNoise: lambda n: {
+        "mean": n._mu,
+        "sigma": n._sigma,
+        "theta": n._theta,
+        "dt": n._dt,
+        "initial_noise": n.initial_noise,
+        "dtype": n._dtype,
+    },
+    noise.VectorizedActionNoise: lambda n: {"base_noise": n.base_noise, "n_envs": n.n_envs},
+    deque: lambda d: {"items": list(d), "maxlen": d.maxlen},
+    np.dtype: lambda d: {"dtype": d.str},
+    np.random.Generator: lambda g: {"state": g.bit_generator.state},
+    th.device: lambda d: {"name": str(d)},
+    th.dtype: lambda d: {"name": str(d).removeprefix("torch.")},
+    type(pathlib.Path()): lambda p: {"path": str(p)},
+}
+# What to call with these arguments, where it is not the class itself.
+_BUILDERS: dict[type, Callable[..., Any]] = {
+    deque: lambda items, maxlen: deque(items, maxlen),
+    np.random.Generator: _load_generator,
+    th.device: lambda name: th.device(name),
+    th.dtype: torch_dtype,
+    type(pathlib.Path()): lambda path: pathlib.Path(path),
+}
+_NAME_OF_OBJECT = {cls: f"{cls.__module__.split('.')[0]}.{cls.__qualname__}" for cls in _ARGUMENTS}
+_NAME_OF_OBJECT[type(pathlib.Path())] = "pathlib.Path"  # a file from Windows loads elsewhere, and back
+_OBJECT_OF_NAME = {name: cls for cls, name in _NAME_OF_OBJECT.items()}
+
+
+class _ObjectEncoder(Encoder):
+    """Adds the objects and classes that the attributes of an algorithm consist of."""
+
+    def encode_other(self, value: Any, where: str) -> Any:
+        cls = type(value)
+        if isinstance(value, np.dtype):
+            cls = np.dtype  # every NumPy dtype has a class of its own
+        if cls is np.random.Generator and type(value.bit_generator) is not np.random.PCG64:
+            raise ValueError(f"{where} is a {value.bit_generator}, and only PCG64 generators can be written")
+        if cls in _ARGUMENTS:
+            return {"!object": [_NAME_OF_OBJECT[cls], self._arguments(_ARGUMENTS[cls](value), where)]}
+        if isinstance(value, type) and value in _NAME_OF_CLASS:
+            return {"!class": _NAME_OF_CLASS[value]}
+        if dataclasses.is_dataclass(cls) and cls in _NAME_OF_CLASS:
+            args = {field.name: getattr(value, field.name) for field in dataclasses.fields(cls) if field.init}
+            return {"!dataclass": [_NAME_OF_CLASS[cls], self._arguments(args, where)]}
+        raise ValueError(f"{where} is {value!r:.100} of type {cls.__name__}")
+
+    def _arguments(self, args: dict[str, Any], where: str) -> dict[str, Any]:
+        return {name: self.encode(value, f"{where}.{name}") for name, value in args.items()}
+
+
+class _ObjectDecoder(Decoder):
+    def decode_other(self, tag: str, content: Any) -> Any:
+        if tag == "!class":
+            return self._registered(content)
+        if tag == "!object":
+            name, args = content
+            if name not in _OBJECT_OF_NAME:
+                raise SavedFileError(f"it holds an object of class {name!r}, which this sb3_said does not load")
+            cls = _OBJECT_OF_NAME[name]
+            return _BUILDERS.get(cls, cls)(**{key: self.decode(arg) for key, arg in args.items()})
+        if tag == "!dataclass":
+            name, args = content
+            cls = self._registered(name)
+            if not dataclasses.is_dataclass(cls):
+                raise SavedFileError(f"it holds an instance of {name!r}, which is not a dataclass")
+            return cls(**{key: self.decode(arg) for key, arg in args.items()})
+        return super().decode_other(tag, content)
+
+    @staticmethod
+    def _registered(name: str) -> type:
+        if name not in _CLASS_OF_NAME:
+            raise SavedFileError(
+                f"it names the class {name!r}, which is not registered. If you trust that class, import the module that"
+                " registers it or call sb3_said.common.save_util.register_class on it; or replace the attribute that"
+                " holds it with load(..., custom_objects={name: value})"
+            )
+        return _CLASS_OF_NAME[name]
+
+
+def save_algorithm(
+    path: PathOrFile, model: BaseAlgorithm, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None
+) -> None:
+    """Write an SB3 algorithm to a zip of JSON and tensors, in the way and with the choices of its own ``save``.
+
+    Neither the environment nor the replay buffer is written. An attribute that holds a function or an object of an
+    unregistered class cannot be written without pickle: it is named in one warning and in the file.
+
+    :param path: where to write; without a suffix, ``.zip`` is added. Or a binary file object.
+    :param exclude: attributes to leave out besides those the algorithm leaves out itself
+    :param include: attributes to write although the algorithm leaves them out
+    """
+    state_dict_names, variable_names = model._get_torch_save_params()
+    excluded = set(exclude or ()) | set(model._excluded_save_params())
+    excluded -= set(include or ())
+    excluded |= {name.split(".")[0] for name in state_dict_names + variable_names}
+    excluded.add("lr_schedule")  # made from learning_rate by _setup_model, in every algorithm
+
+    data: dict[str, Any] = {}
+    blobs: dict[str, Any] = {}
+    missing: dict[str, str] = {}
+    for name, value in vars(model).items():
+        if name in excluded:
+            continue
+        encoder = _ObjectEncoder()
+        try:
+            data[name] = encoder.encode(value, name)
+        except (ValueError, RecursionError) as error:
+            missing[name] = str(error)
+        else:
+            blobs |= encoder.blobs
+    if missing:
+        warnings.warn(
+            "Attributes that are not in the saved file, because functions and objects of unregistered classes cannot be"
+            f" written without pickle: {'; '.join(missing.values())}. To load the file with them, use load(...,"
+            f" custom_objects={{{', '.join(f'{name!r}: ...' for name in missing)}}}); a class of your own can be"
+            " registered with sb3_said.common.save_util.register_class.",
+            stacklevel=3,
+        )
+    variables = {name: recursive_getattr(model, name) for name in variable_names}
+    tensors = Encoder()
+    root = {
+        "data": data,
+        "missing": sorted(missing),
+        "params": tensors.encode(model.get_parameters(), "params"),
+        "pytorch_variables": tensors.encode(variables, "pytorch_variables"),
+    }
+    if isinstance(path, (str, os.PathLike)) and pathlib.Path(path).suffix == "":
+        path = f"{os.fspath(path)}.zip"
+    write_file(path, "algorithm", root, blobs | tensors.blobs, {"algorithm": type(model).__name__})
+
+
+def load_algorithm_file(
+    path: PathOrFile,
+    device: th.device | str = "auto",
+    custom_objects: dict[str, Any] | None = None,
+    allow_pickle: bool = False,
+    load_data: bool = True,
+) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any] | None]:
+    """Read what :func:`save_algorithm` wrote, running no code from the file.
+
+    :param path: path, with or without its ``.zip``, or a seekable binary file object
+    :param device: where attributes and variables that are tensors go. State dicts stay on the CPU:
+        ``load_state_dict`` copies them to where the networks are.
+    :param custom_objects: attributes to take instead of those in the file, which are then not even decoded
+    :param allow_pickle: also read Stable-Baselines3's own files, which can run any code: only for files you trust
+    :param load_data: False skips the attributes and reads only parameters
+    :return: attributes, state dicts by name, and other PyTorch variables by name
+    :raises ValueError: if the file is damaged, foreign, newer than this package, names an unregistered class, or holds
+        a pickle and ``allow_pickle`` is False
+    """
+    path = _existing(path)
+    custom_objects = custom_objects or {}
+    if allow_pickle and _holds_pickle(path):
+        pickled, params, variables = load_from_zip_file(path, load_data, custom_objects, device)  # type: ignore[arg-type]
+        return pickled or {}, params, variables
+    try:
+        saved = read_file(path, "algorithm")
+    except PickleRefusedError as error:
+        raise PickleRefusedError(
+            f"{error} Unpickling runs whatever code the file's author put there, so files with pickles, such as those"
+            " that Stable-Baselines3 itself saves, are refused. If you trust the author, use"
+            " load(path, allow_pickle=True), and save the agent again to get a file without pickles."
+        ) from error
+    decoder = _ObjectDecoder(saved.blobs, get_device(device))
+    with readable(path):
+        nodes, missing = saved.root["data"] if load_data else {}, saved.root["missing"]
+        supplied = {name: value for name, value in custom_objects.items() if name in nodes or name in missing}
+        data = {name: decoder.decode(node) for name, node in nodes.items() if name not in supplied} | supplied
+        variables = decoder.decode(saved.root["pytorch_variables"])
+        params = Decoder(saved.blobs).decode(saved.root["params"])
+    absent = [name for name in missing if name not in supplied]
+    if absent and load_data:
+        warnings.warn(
+            f"The file lacks {', '.join(absent)}, which could not be written without pickle: the algorithm's defaults"
+            f" are used. To supply them, use load(..., custom_objects={{{', '.join(f'{n!r}: ...' for n in absent)}}}).",
+            stacklevel=3,
+        )
+    return data, params, variables
+
+
+class SafeSaveMixin(BaseAlgorithm):
+    """Makes an SB3 algorithm save to and load from files without pickle. Name it before the algorithm.
+
+    >>> from stable_baselines3 import SAC
+    >>> class SafeSAC(SafeSaveMixin, SAC):
+    ...     pass
+    """
+
+    def save(  # type: ignore[override]
+        self, path: PathOrFile, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None
+    ) -> None:
+        """Write the agent to a file; see :func:`save_algorithm`."""
+        save_algorithm(path, self, exclude, include)
+
+    @classmethod
+    def load(  # type: ignore[override]
+        cls: type[SelfSafeSave],
+        path: PathOrFile,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        allow_pickle: bool = False,
+        **kwargs: Any,
+    ) -> SelfSafeSave:
+        """Build an agent from a file, running no code from it.
+
+        The arguments are those of SB3's ``load``, and one more.
+
+        :param path: path, with or without its ``.zip``, or a seekable binary file object
+        :param env: the environment to go on learning in; None is enough for ``predict``
+        :param device: where the agent computes
+        :param custom_objects: attributes to take instead of those in the file, by name
+        :param print_system_info: print library versions, here and where the file was written
+        :param force_reset: reset ``env`` before learning goes on
+        :param allow_pickle: also load files of SB3's own ``save``, which can run any code: only for files you trust
+        :param kwargs: attributes to set to other values than the file has
+        :raises ValueError: if the file cannot be loaded safely (see :func:`load_algorithm_file`), or its spaces or
+            policy arguments differ from those given
+        """
+        path = _existing(path)
+        if allow_pickle and _holds_pickle(path):
+            return super().load(
+                path,  # type: ignore[arg-type]
+                env,
+                device,
+                custom_objects,
+                print_system_info,
+                force_reset,
+                **kwargs,
+            )
+        if print_system_info:
+            print("== CURRENT SYSTEM INFO ==")
+            get_system_info()
+            print("== SAVED MODEL SYSTEM INFO ==", load_metadata(path)["versions"], sep="\n")
+        data, params, variables = load_algorithm_file(path, device, custom_objects)
+        _check_data(data, kwargs)
+        if env is not None:
+            env = cls._wrap_env(env, data.get("verbose", 0))
+            check_for_correct_spaces(env, data["observation_space"], data["action_space"])
+            if force_reset:
+                data["_last_obs"] = None
+            data["n_envs"] = env.num_envs
+
+        model = cls(policy=data["policy_class"], env=env, device=device, _init_setup_model=False)  # type: ignore[call-arg]
+        vars(model).update(data | kwargs)
+        model._setup_model()
+        try:
+            model.set_parameters(params, exact_match=True, device=device)
+        except (RuntimeError, ValueError) as error:
+            raise ValueError(
+                f"The parameters in the file do not fit {cls.__name__} with policy_kwargs {model.policy_kwargs}:"
+                f" {error}. Load it with the class that saved it; policy_kwargs that could not be written are given as"
+                " load(..., custom_objects={'policy_kwargs': ...})."
+            ) from error
+        for name, value in (variables or {}).items():
+            # None: the algorithm has this variable only in another configuration (SAC's fixed or learned entropy).
+            if value is not None:
+                recursive_setattr(model, f"{name}.data", value)
+        if model.use_sde:
+            model.policy.reset_noise()  # type: ignore[operator]
+        return model
+
+    def set_parameters(
+        self,
+        load_path_or_dict: PathOrFile | dict[str, Any],
+        exact_match: bool = True,
+        device: th.device | str = "auto",
+        allow_pickle: bool = False,
+    ) -> None:
+        """As SB3's, where a path has to be that of a file without pickles, unless ``allow_pickle`` is True."""
+        if not isinstance(load_path_or_dict, dict):
+            load_path_or_dict = load_algorithm_file(load_path_or_dict, device, None, allow_pickle, load_data=False)[1]
+        super().set_parameters(load_path_or_dict, exact_match, device)
+
+
+def _existing(path: PathOrFile) -> PathOrFile:
+    """Add ``.zip`` where the path alone is no file, as SB3 does."""
+    if not isinstance(path, (str, os.PathLike)) or os.path.isfile(path):
+        return path
+    if os.path.isfile(f"{os.fspath(path)}.zip"):
+        return f"{os.fspath(path)}.zip"
+    raise FileNotFoundError(f"There is no file '{os.fspath(path)}' and no '{os.fspath(path)}.zip'.")
+
+
+def _holds_pickle(path: PathOrFile) -> bool:
+    try:
+        load_metadata(path)
+    except PickleRefusedError:
+        return True
+    return False
+
+
+def _check_data(data: dict[str, Any], kwargs: dict[str, Any]) -> None:
+    """:raises ValueError: if attributes from a file do not suffice to build an agent, or contradict the given ones"""
+    if absent := [name for name in ("policy_class", "observation_space", "action_space") if name not in data]:
+        raise ValueError(
+            f"The file lacks {', '.join(absent)}, without which no agent can be built. Give them as"
+            " load(..., custom_objects={name: value})."
+        )
+    kinds = {
+        "policy_class": type,
+        "observation_space": spaces.Space,
+        "action_space": spaces.Space,
+        "policy_kwargs": dict,
+    }
+    for name, kind in kinds.items():
+        if not isinstance(data.get(name, kwargs.get(name)), (kind, type(None))):
+            raise ValueError(f"The file's {name} is {data[name]!r:.100}, not a {kind.__name__}: it has been damaged.")
+    stored = data.get("policy_kwargs", {})
+    stored.pop("device", None)
+    if "policy_kwargs" in data and kwargs.get("policy_kwargs", stored) != stored:
+        raise ValueError(
+            f"The given policy_kwargs {kwargs['policy_kwargs']} differ from {stored} in the file, which the saved"
+            " networks were built with. Leave them out of the call."
+        )

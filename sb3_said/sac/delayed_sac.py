@@ -1,0 +1,75 @@
+"""Soft actor-critic for delayed observations."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+from stable_baselines3 import SAC
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+
+from sb3_said.common.buffers import DelayedReplayBuffer
+from sb3_said.common.save_util import SafeSaveMixin
+from sb3_said.sac.policies import DelayedSACPolicy
+
+
+class DelayedSAC(SafeSaveMixin, SAC):
+    """SAC whose actor knows the actions sent since and whose critics know the true state (SADR).
+
+    Two flags span the baselines of "Addressing Signal Delay in Deep RL" (Wang et al., ICLR 2024):
+
+    ============= ============= =======================
+    name          augment_state delay_reconciled_critic
+    ============= ============= =======================
+    SAC           False         False
+    SA            True          False
+    DR            False         True
+    SADR          True          True
+    ============= ============= =======================
+
+    The critics' true states come from replay (they arrive a few steps later on a real system too); acting needs none.
+    On a task without ``DelayedObservationWrapper`` this is SB3's SAC, update for update.
+
+    :param policy: ``"MultiInputPolicy"`` or ``"MlpPolicy"``, which name the same class
+    :param env: a task in a ``DelayedObservationWrapper``, or one with a 1-D Box observation (delay 0)
+    :param learning_rate: of actor, critics and entropy coefficient; a number or a schedule
+    :param augment_state: the actor reads [observation, action history, age]
+    :param delay_reconciled_critic: the critics read the true state
+    :param sac_kwargs: every other argument of :class:`stable_baselines3.SAC`
+    :raises ValueError: for spaces that are neither, or options that need another replay buffer (``n_steps`` > 1)
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": DelayedSACPolicy,
+        "MultiInputPolicy": DelayedSACPolicy,
+    }
+    policy: DelayedSACPolicy
+    replay_buffer: DelayedReplayBuffer
+
+    def __init__(
+        self,
+        policy: str | type[DelayedSACPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 3e-4,
+        *,
+        augment_state: bool = True,
+        delay_reconciled_critic: bool = True,
+        **sac_kwargs: Any,
+    ):
+        if sac_kwargs.get("n_steps", 1) != 1:
+            raise ValueError(f"DelayedSAC learns from one-step targets, got n_steps={sac_kwargs['n_steps']}; leave it 1.")
+        self.augment_state = augment_state
+        self.delay_reconciled_critic = delay_reconciled_critic
+        super().__init__(policy, env, learning_rate, **sac_kwargs)
+
+    def _setup_model(self) -> None:
+        if self.replay_buffer_class is None:
+            self.replay_buffer_class = DelayedReplayBuffer
+        user_kwargs = self.policy_kwargs
+        self.policy_kwargs = {**user_kwargs, **self._policy_flags()}
+        super()._setup_model()
+        self.policy_kwargs = user_kwargs
+
+    def _policy_flags(self) -> dict[str, Any]:
+        """Return what the policy's constructor needs of this algorithm's own arguments."""
+        return {"augment_state": self.augment_state, "delay_reconciled_critic": self.delay_reconciled_critic}
