@@ -1,0 +1,113 @@
+"""Every setting of the planner, with its default and where that comes from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from sb3_said.planner import diffusion, dit, inpainting, normalizer, precision
+
+SCORED_STATES = ("future", "all")
+LR_SCHEDULES = ("cosine", "constant")
+
+
+@dataclass(frozen=True)
+class PlannerConfig:
+    """Every setting of the planner and of its training; :meth:`paper` gives the paper's.
+
+    "measured" marks what small trials on two CPU cores favoured, "paper" what SAID states in text and tables,
+    "DV" the public code it follows where it states nothing (Lu et al. 2025).
+
+    :raises ValueError: for a value outside what its comment allows
+    """
+
+    # Architecture
+    depth: int = 2  # DV; the paper searches 2, 4, 8, and twice the depth costs twice the time
+    d_model: int = 256  # paper; a multiple of 32
+    horizon: int = 8  # paper; a window is max_delay + horizon steps, >= 2 so that a state follows the decision
+    positions: str = "sinusoidal"  # paper, with all frequencies alive; or "learned"
+    embed_known: bool = True  # measured: buys as much accuracy as doubling the depth
+    # Diffusion
+    prediction: str = "v"  # measured: safe with few steps; or "epsilon" (paper), "x0"
+    schedule: str = "cosine"  # measured; or "linear" (DV)
+    time_sampling: str = "logit_normal"  # measured: lower error of the decoded present; or "uniform" (DV)
+    mask: str = "random"  # one network for every delay; or "fixed" at max_delay (paper)
+    mask_end_probability: float = 0.5  # a guess: the longest mask is the hardest; in [0, 1]
+    action_transform: str = "standard"  # measured: z-score; or "tanh" (paper): clip to 0.999, arctanh, z-score
+    # Sampling
+    solver: str = "ddim"  # paper; or "dpmsolver++2m"
+    time_grid: str = "uniform"  # DV; or "log_snr"
+    sampling_steps: int = 5  # 99.6 % of the paper's return with 20
+    n_candidates: int = 16  # measured; the paper's 50 cost three times as much
+    temperature: float = 0.5  # measured; factor on the initial noise, >= 0; the paper tunes 0.1 to 1 per task
+    scored_states: str = "future"  # measured: states after the decision index; or "all" but the first (paper)
+    # Training
+    learning_rate: float = 1e-3  # measured, together with the warm-up
+    lr_schedule: str = "cosine"  # paper: down to 0; or "constant"
+    warmup_steps: int = 200  # measured
+    weight_decay: float = 1e-5  # DV
+    betas: tuple[float, float] = (0.9, 0.999)  # DV, PyTorch's
+    batch_size: int = 128  # DV
+    gradient_clip: float | None = 1.0  # usual for transformers at this learning rate; None clips nothing
+    ema_decay: float = 0.9999  # paper
+    ema_warmup: bool = True  # without it 37 % of the initial weights remain after 10,000 steps
+    weight_factor: float = 2.0  # paper: beta in the window weight exp(beta * (value - 1))
+    precision: str = "auto"  # bfloat16 autocast where the hardware has it; or "float32", "bfloat16"
+
+    def __post_init__(self) -> None:
+        for name, choices in (
+            ("positions", dit.POSITIONS),
+            ("prediction", diffusion.PREDICTIONS),
+            ("schedule", diffusion.SCHEDULES),
+            ("time_sampling", diffusion.TIME_SAMPLINGS),
+            ("mask", inpainting.MASKS),
+            ("action_transform", normalizer.ACTION_TRANSFORMS),
+            ("solver", diffusion.SOLVERS),
+            ("time_grid", diffusion.TIME_GRIDS),
+            ("scored_states", SCORED_STATES),
+            ("lr_schedule", LR_SCHEDULES),
+            ("precision", precision.PRECISIONS),
+        ):
+            diffusion.check_choice(name, getattr(self, name), choices)
+        object.__setattr__(self, "betas", tuple(self.betas))  # JSON gives a list back
+        at_least = {"depth": 1, "horizon": 2, "sampling_steps": 1, "n_candidates": 1, "batch_size": 1}
+        at_least |= {"temperature": 0, "warmup_steps": 0, "weight_decay": 0, "weight_factor": 0}
+        for name, smallest in at_least.items():
+            if not getattr(self, name) >= smallest:
+                raise ValueError(f"{name} is {getattr(self, name)}, expected at least {smallest}.")
+        if self.d_model < dit.HEAD_DIM or self.d_model % dit.HEAD_DIM:
+            raise ValueError(f"d_model is {self.d_model}, expected a multiple of {dit.HEAD_DIM}.")
+        if not self.learning_rate > 0 or not (self.gradient_clip is None or self.gradient_clip > 0):
+            raise ValueError(
+                f"learning_rate is {self.learning_rate} and gradient_clip {self.gradient_clip}, expected positive "
+                "numbers; to switch clipping off, give gradient_clip=None."
+            )
+        for name in ("mask_end_probability", "ema_decay"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, expected a number in [0, 1].")
+
+    @classmethod
+    def paper(cls, depth: int = 8, temperature: float = 0.6, **changes: object) -> PlannerConfig:
+        """Return the paper's settings; depth and temperature are the two it tunes per task.
+
+        :param changes: other fields to set
+        """
+        config = cls(
+            depth=depth,
+            embed_known=False,
+            prediction="epsilon",
+            schedule="linear",
+            time_sampling="uniform",
+            mask="fixed",
+            action_transform="tanh",
+            sampling_steps=20,
+            n_candidates=50,
+            temperature=temperature,
+            scored_states="all",
+            learning_rate=2e-4,
+            warmup_steps=0,
+            batch_size=256,
+            gradient_clip=None,
+            ema_warmup=False,
+            precision="float32",
+        )
+        return replace(config, **changes)  # type: ignore[arg-type]

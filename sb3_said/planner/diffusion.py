@@ -1,0 +1,182 @@
+"""Variance-preserving diffusion in continuous time: schedules, predictions, solvers. Knows no network.
+
+A noisy sample at time t is ``x = alpha(t) * clean + sigma(t) * noise`` with ``alpha^2 + sigma^2 = 1``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import torch as th
+
+START_TIME = 1e-3  # the cleanest time, in training and as the last solver time (CleanDiffuser, and so the paper)
+END_TIMES = {
+    "cosine": 0.9946,  # alpha(1) is 0 and could not be divided by; the same stop as DPM-Solver's
+    "linear": 1.0,
+}
+SCHEDULES = tuple(END_TIMES)
+PREDICTIONS = ("v", "epsilon", "x0")
+TIME_SAMPLINGS = ("uniform", "logit_normal")
+SOLVERS = ("ddim", "dpmsolver++2m")
+TIME_GRIDS = ("uniform", "log_snr")
+
+
+def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
+    """Refuse a name that is not among the choices.
+
+    :raises ValueError: saying what was given and what was expected
+    """
+    if value not in choices:
+        raise ValueError(f"{name} is {value!r}, expected one of {tuple(choices)}.")
+
+
+def alpha_sigma(t: th.Tensor, schedule: str) -> tuple[th.Tensor, th.Tensor]:
+    """Return the factors of the clean sample and of the noise, each of the shape of t.
+
+    :param t: diffusion times in [0, ``END_TIMES[schedule]``]
+    :param schedule: ``"cosine"`` (Nichol and Dhariwal 2021) or ``"linear"`` (the paper's, as in DV)
+    """
+    check_choice("schedule", schedule, SCHEDULES)
+    if schedule == "cosine":
+        return th.cos(math.pi / 2 * t), th.sin(math.pi / 2 * t)
+    log_alpha = -(20.0 - 0.1) / 4 * t**2 - 0.1 / 2 * t
+    return log_alpha.exp(), (-th.expm1(2 * log_alpha)).sqrt()  # expm1: 1 - alpha^2 cancels near t = 0
+
+
+def add_noise(clean: th.Tensor, noise: th.Tensor, alpha: th.Tensor, sigma: th.Tensor) -> th.Tensor:
+    """Return the noisy sample; all arguments broadcast against each other."""
+    return alpha * clean + sigma * noise
+
+
+def prediction_target(
+    clean: th.Tensor, noise: th.Tensor, alpha: th.Tensor, sigma: th.Tensor, prediction: str
+) -> th.Tensor:
+    """Return what the network is trained to predict: the noise, the clean sample, or v = alpha noise - sigma clean.
+
+    :param prediction: ``"v"`` (Salimans and Ho 2022), ``"epsilon"`` (the paper's) or ``"x0"``
+    """
+    check_choice("prediction", prediction, PREDICTIONS)
+    if prediction == "epsilon":
+        return noise
+    return clean if prediction == "x0" else alpha * noise - sigma * clean
+
+
+def to_clean(
+    output: th.Tensor, x: th.Tensor, alpha: float | th.Tensor, sigma: float | th.Tensor, prediction: str
+) -> th.Tensor:
+    """Return the clean sample that a prediction at a noisy sample x implies; arguments broadcast."""
+    check_choice("prediction", prediction, PREDICTIONS)
+    if prediction == "epsilon":
+        return (x - sigma * output) / alpha
+    return output if prediction == "x0" else alpha * x - sigma * output
+
+
+def to_noise(
+    output: th.Tensor, x: th.Tensor, alpha: float | th.Tensor, sigma: float | th.Tensor, prediction: str
+) -> th.Tensor:
+    """Return the noise that a prediction at a noisy sample x implies; arguments broadcast."""
+    check_choice("prediction", prediction, PREDICTIONS)
+    if prediction == "x0":
+        return (x - alpha * output) / sigma
+    return output if prediction == "epsilon" else sigma * x + alpha * output
+
+
+def draw_times(
+    n: int, schedule: str, time_sampling: str, generator: th.Generator | None = None, device: th.device | str = "cpu"
+) -> th.Tensor:
+    """Draw training times: (n,) float32 in [START_TIME, END_TIMES[schedule]].
+
+    :param time_sampling: ``"uniform"`` (the paper's) or ``"logit_normal"`` (Esser et al. 2024), more in the middle
+    """
+    check_choice("schedule", schedule, SCHEDULES)
+    check_choice("time_sampling", time_sampling, TIME_SAMPLINGS)
+    source = "cpu" if generator is None else generator.device
+    if time_sampling == "uniform":
+        fraction = th.rand(n, generator=generator, device=source)
+    else:
+        fraction = th.randn(n, generator=generator, device=source).sigmoid()
+    return (START_TIME + (END_TIMES[schedule] - START_TIME) * fraction).to(device)
+
+
+class SolverStep(NamedTuple):
+    """One denoising step: ``x_next = keep * x + clean * x0 + previous * x0_of_the_step_before``."""
+
+    t: float
+    alpha: float
+    sigma: float
+    keep: float
+    clean: float
+    previous: float
+
+
+def solver_times(n_steps: int, schedule: str, time_grid: str = "uniform") -> list[float]:
+    """Return the n_steps + 1 times a solver visits, from the noisiest to START_TIME.
+
+    :param time_grid: ``"uniform"`` in time (the paper's) or ``"log_snr"``, uniform in log(alpha / sigma)
+    """
+    check_choice("schedule", schedule, SCHEDULES)
+    check_choice("time_grid", time_grid, TIME_GRIDS)
+    if n_steps < 1:
+        raise ValueError(f"The number of solver steps is {n_steps}, expected at least 1.")
+    if time_grid == "uniform":
+        return np.linspace(END_TIMES[schedule], START_TIME, n_steps + 1).tolist()
+    t = np.geomspace(END_TIMES[schedule], START_TIME, 20_000)  # fine enough to invert log(alpha / sigma) by a table
+    alpha, sigma = alpha_sigma(th.from_numpy(t), schedule)
+    log_snr = (alpha / sigma).log().numpy()  # increasing
+    return np.interp(np.linspace(log_snr[0], log_snr[-1], n_steps + 1), log_snr, t).tolist()
+
+
+@cache
+def solver_steps(solver: str, schedule: str, n_steps: int, time_grid: str = "uniform") -> tuple[SolverStep, ...]:
+    """Return the coefficients of every step as Python floats.
+
+    :param solver: ``"ddim"`` (Song et al. 2021, eta 0) or ``"dpmsolver++2m"`` (Lu et al. 2022, multistep, the first and
+        the last step of first order)
+    :param schedule: see :func:`alpha_sigma`
+    :param n_steps: number of network evaluations
+    :param time_grid: see :func:`solver_times`
+    :raises ValueError: for an unknown name or n_steps < 1
+    """
+    check_choice("solver", solver, SOLVERS)
+    times = solver_times(n_steps, schedule, time_grid)
+    alphas, sigmas = (values.tolist() for values in alpha_sigma(th.tensor(times, dtype=th.float64), schedule))
+    log_snr = [math.log(alpha / sigma) for alpha, sigma in zip(alphas, sigmas, strict=True)]
+    steps = []
+    for i in range(n_steps):
+        keep = sigmas[i + 1] / sigmas[i]
+        clean, previous = alphas[i + 1] - alphas[i] * keep, 0.0  # both solvers' first-order step
+        if solver == "dpmsolver++2m" and 0 < i < n_steps - 1:
+            ratio = (log_snr[i] - log_snr[i - 1]) / (log_snr[i + 1] - log_snr[i])
+            previous = -clean / (2 * ratio)
+            clean -= previous  # extrapolates the clean sample linearly in log SNR
+        steps.append(SolverStep(times[i], alphas[i], sigmas[i], keep, clean, previous))
+    return tuple(steps)
+
+
+def solve(
+    predict: Callable[[th.Tensor, int], th.Tensor],
+    x: th.Tensor,
+    steps: Sequence[SolverStep],
+    prediction: str,
+    impose: Callable[[th.Tensor], th.Tensor] = lambda x: x,
+) -> th.Tensor:
+    """Run a solver from initial noise to a sample.
+
+    :param predict: gives the network's output at (x, index of the step)
+    :param x: initial noise, any shape, float32
+    :param steps: from :func:`solver_steps`
+    :param prediction: what ``predict`` predicts, see :func:`prediction_target`
+    :param impose: applied to the initial noise and after every step, the last included
+    """
+    x, before = impose(x), None
+    for i, step in enumerate(steps):
+        x0 = to_clean(predict(x, i), x, step.alpha, step.sigma, prediction)
+        x_next = step.keep * x + step.clean * x0
+        if before is not None and step.previous != 0.0:
+            x_next = x_next + step.previous * before
+        x, before = impose(x_next), x0
+    return x

@@ -1,0 +1,176 @@
+"""A one-dimensional diffusion transformer: one token per time step of a window."""
+
+from __future__ import annotations
+
+import math
+
+import torch as th
+import torch.nn.functional as F
+from torch import nn
+
+POSITIONS = ("sinusoidal", "learned")
+HEAD_DIM = 32  # d_model // 32 heads, as in DV and the paper
+N_TIME_FEATURES = 32  # as CleanDiffuser's Fourier embedding
+
+
+def sinusoidal_positions(length: int, d_model: int) -> th.Tensor:
+    """Return a fixed embedding of the positions 0..length-1: (length, d_model) float32.
+
+    The angular frequencies run from 1 to 1/length radians a step, so that every pair of features changes over a window.
+    The public code under the paper's results multiplies integers instead, where all frequencies but the first are 0.
+    """
+    frequencies = float(length) ** -th.linspace(0.0, 1.0, d_model // 2)  # (d_model / 2,)
+    angles = th.arange(length, dtype=th.float32)[:, None] * frequencies  # (L, d_model / 2)
+    return th.cat([angles.sin(), angles.cos()], dim=-1)
+
+
+def _modulate(x: th.Tensor, shift: th.Tensor, scale: th.Tensor) -> th.Tensor:
+    """Layer-normalise the tokens, then scale by 1 + scale and shift.
+
+    :param x: (M, L, d_model)
+    :param shift: (M or 1, d_model)
+    :param scale: (M or 1, d_model)
+    """
+    if len(shift) == 1:  # one time for all: the modulation is the norm's own affine map, one kernel instead of three
+        return F.layer_norm(x, x.shape[-1:], 1 + scale[0], shift[0], eps=1e-6)
+    return F.layer_norm(x, x.shape[-1:], eps=1e-6) * (1 + scale[:, None]) + shift[:, None]
+
+
+class DiTBlock(nn.Module):
+    """Attention and MLP with adaLN-zero (Peebles and Xie 2023) on a true residual stream.
+
+    The public code under the paper's results overwrites the stream with its normalised version in each block; here
+    the identity path runs through the whole depth.
+    """
+
+    def __init__(self, d_model: int) -> None:
+        super().__init__()
+        self.qkv = nn.Linear(d_model, 3 * d_model)
+        self.attention_out = nn.Linear(d_model, d_model)
+        self.mlp = nn.Sequential(
+            nn.Linear(d_model, 4 * d_model), nn.GELU(approximate="tanh"), nn.Linear(4 * d_model, d_model)
+        )
+
+    def forward(self, x: th.Tensor, modulation: th.Tensor, attend: th.Tensor | None = None) -> th.Tensor:
+        """
+        :param x: (M, L, d_model)
+        :param modulation: (M or 1, 6, d_model): shift, scale and gate of the attention, then of the MLP
+        :param attend: (M, 1, 1, L) bool, the tokens that may be attended to; all by default
+        """
+        shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = modulation.unbind(1)  # each (M or 1, d_model)
+        x = x + gate_a[:, None] * self._attention(_modulate(x, shift_a, scale_a), attend)
+        return x + gate_m[:, None] * self.mlp(_modulate(x, shift_m, scale_m))
+
+    def _attention(self, x: th.Tensor, attend: th.Tensor | None) -> th.Tensor:
+        q, k, v = self.qkv(x).unflatten(-1, (3, -1, HEAD_DIM)).permute(2, 0, 3, 1, 4)  # each (M, heads, L, HEAD_DIM)
+        mixed = F.scaled_dot_product_attention(q, k, v, attn_mask=attend)
+        return self.attention_out(mixed.transpose(1, 2).flatten(2))
+
+
+class DiT1d(nn.Module):
+    """Predict the clean window, the noise or a mixture from a noisy window whose known entries are clean.
+
+    A call has three parts, because two of them do not change from one denoising step or candidate to the next:
+    :meth:`modulations` depends on the time alone, :meth:`context` on what is known alone, :meth:`forward` on both.
+
+    :param obs_dim: numbers in a state
+    :param act_dim: numbers in an action
+    :param max_delay: D, the most actions that can be known
+    :param length: L, steps of a window
+    :param d_model: width, a multiple of 32
+    :param depth: number of blocks
+    :param positions: ``"sinusoidal"`` (fixed) or ``"learned"``
+    :param embed_known: add an embedding of the whole known part to every token, beside showing it in its place
+    :raises ValueError: for a width that is no multiple of 32 or an unknown kind of positions
+    """
+
+    frequencies: th.Tensor
+
+    def __init__(
+        self,
+        obs_dim: int,
+        act_dim: int,
+        max_delay: int,
+        length: int,
+        d_model: int = 256,
+        depth: int = 2,
+        positions: str = "sinusoidal",
+        embed_known: bool = True,
+    ) -> None:
+        super().__init__()
+        if d_model < HEAD_DIM or d_model % HEAD_DIM:
+            raise ValueError(f"d_model is {d_model}, but heads are {HEAD_DIM} wide: give a multiple of {HEAD_DIM}.")
+        if positions not in POSITIONS:
+            raise ValueError(f"positions is {positions!r}, expected one of {POSITIONS}.")
+        self.d_model = d_model
+        self.obs_dim = obs_dim
+        self.max_delay = max_delay
+        self.token_embedding = nn.Linear(obs_dim + act_dim, d_model)
+        self.flag_embedding = nn.Linear(2, d_model, bias=False)
+        self.known_embedding = _mlp(obs_dim + max_delay * (act_dim + 1), d_model) if embed_known else None
+        self.time_embedding = _mlp(N_TIME_FEATURES, d_model)
+        # One linear map for the modulations of all blocks (6 each) and of the output (2): one product instead of many
+        self.modulation = nn.Linear(d_model, (6 * depth + 2) * d_model)
+        self.blocks = nn.ModuleList(DiTBlock(d_model) for _ in range(depth))
+        self.out = nn.Linear(d_model, obs_dim + act_dim)
+        # Periods of 4 to 1/16 of the diffusion time: smooth enough for few steps, fine enough near t = 0
+        self.register_buffer("frequencies", 2 * math.pi * 2 ** th.linspace(-2.0, 4.0, N_TIME_FEATURES // 2))
+        for module in self.modules():
+            if isinstance(module, nn.Linear):
+                nn.init.xavier_uniform_(module.weight)
+                if module.bias is not None:
+                    nn.init.zeros_(module.bias)
+        # adaLN-zero: every block is the identity and the output is 0 before training
+        for layer in (self.modulation, self.out):
+            nn.init.zeros_(layer.weight)
+        self.positions: th.Tensor
+        if positions == "learned":
+            self.positions = nn.Parameter(0.02 * th.randn(length, d_model))
+        else:
+            self.register_buffer("positions", sinusoidal_positions(length, d_model))
+
+    def modulations(self, t: th.Tensor) -> th.Tensor:
+        """Return what the time changes in every layer: (n, 6 * depth + 2, d_model) float32.
+
+        :param t: (n,) float32 diffusion times, one per window, or a single one for all windows
+        """
+        angles = t[:, None] * self.frequencies  # (n, N_TIME_FEATURES / 2)
+        embedded = self.time_embedding(th.cat([angles.cos(), angles.sin()], dim=-1))  # (n, d_model)
+        rows = self.modulation(F.silu(embedded)).unflatten(-1, (-1, self.d_model))
+        return rows.float()  # the residual stream they act on is float32, also under autocast
+
+    def context(self, window: th.Tensor, known: th.Tensor) -> th.Tensor:
+        """Return what is added to the tokens because of their place and of what is known: (B, L, d_model).
+
+        :param window: (B, L, obs_dim + act_dim), normalised; only known entries are read
+        :param known: (B, L, obs_dim + act_dim) bool known mask
+        """
+        flags = known[..., [0, self.obs_dim]].to(window.dtype)  # (B, L, 2): state known, action known
+        added = self.flag_embedding(flags) + self.positions
+        if self.known_embedding is None:
+            return added
+        given = th.where(known, window, 0.0)
+        state, actions = given[:, 0, : self.obs_dim], given[:, : self.max_delay, self.obs_dim :]
+        part = th.cat([state, actions.flatten(1), flags[:, : self.max_delay, 1]], dim=1)
+        return added + self.known_embedding(part)[:, None]
+
+    def forward(
+        self, x: th.Tensor, context: th.Tensor, modulations: th.Tensor, valid: th.Tensor | None = None
+    ) -> th.Tensor:
+        """Return the prediction for each entry: (B * N, L, obs_dim + act_dim).
+
+        :param x: (B * N, L, obs_dim + act_dim) noisy windows, known entries clean; N in a row share a context
+        :param context: (B, L, d_model), from :meth:`context`
+        :param modulations: (B * N or 1, 6 * depth + 2, d_model), from :meth:`modulations`
+        :param valid: (B * N, L) bool, the tokens that may be attended to; all by default
+        """
+        tokens = self.token_embedding(x).unflatten(0, (len(context), -1)) + context[:, None]  # (B, N, L, d_model)
+        tokens = tokens.flatten(0, 1)
+        attend = None if valid is None else valid[:, None, None, :]  # (B * N, 1, 1, L)
+        for i, block in enumerate(self.blocks):
+            tokens = block(tokens, modulations[:, 6 * i : 6 * i + 6], attend)
+        return self.out(_modulate(tokens, modulations[:, -2], modulations[:, -1]))
+
+
+def _mlp(n_in: int, d_model: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(n_in, d_model), nn.SiLU(), nn.Linear(d_model, d_model))

@@ -1,0 +1,276 @@
+"""The inpainting planner: hidden present and plan from a delayed observation and the actions sent since."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import NamedTuple
+
+import torch as th
+from torch import nn
+
+from sb3_said.common.windows import Windows
+from sb3_said.planner import diffusion, inpainting
+from sb3_said.planner.config import PlannerConfig
+from sb3_said.planner.dit import DiT1d
+from sb3_said.planner.normalizer import Normalizer
+from sb3_said.planner.precision import autocast
+
+ValueFn = Callable[[th.Tensor, th.Tensor], th.Tensor]
+
+
+class Plan(NamedTuple):
+    """Candidate plans for B decisions, in environment units."""
+
+    action: th.Tensor  # (B, act_dim), in [-1, 1]: the best candidate's action at the decision index
+    states: th.Tensor  # (B, N, L, obs_dim)
+    actions: th.Tensor  # (B, N, L, act_dim), in [-1, 1]
+    values: th.Tensor  # (B, N), the scores the best was chosen by
+
+
+class InpaintingPlanner(nn.Module):
+    """State-Action Inpainting Diffuser: inpaints the unknown part of a window of states and actions.
+
+    :param obs_dim: numbers in a state
+    :param act_dim: numbers in an action
+    :param max_delay: D, the largest delay it plans for; 0 is an ordinary planner
+    :param config: settings; ``PlannerConfig()`` by default
+    :raises ValueError: for dimensions below 1 or a negative max_delay
+
+    >>> planner = InpaintingPlanner(obs_dim=3, act_dim=1, max_delay=2)
+    >>> plan = planner.plan(th.zeros(1, 3), th.zeros(1, 2, 1), delay=th.tensor([2]))
+    >>> plan.action.shape, plan.states.shape
+    (torch.Size([1, 1]), torch.Size([1, 1, 10, 3]))
+    """
+
+    def __init__(self, obs_dim: int, act_dim: int, max_delay: int, config: PlannerConfig | None = None) -> None:
+        super().__init__()
+        if obs_dim < 1 or act_dim < 1 or max_delay < 0:
+            raise ValueError(
+                f"obs_dim, act_dim and max_delay are {obs_dim}, {act_dim} and {max_delay}, "
+                "expected at least 1, 1 and 0."
+            )
+        self.config = config = PlannerConfig() if config is None else config
+        self.obs_dim, self.act_dim, self.max_delay = obs_dim, act_dim, max_delay
+        self.window_length = max_delay + config.horizon
+        self.network = DiT1d(
+            obs_dim,
+            act_dim,
+            max_delay,
+            self.window_length,
+            config.d_model,
+            config.depth,
+            config.positions,
+            config.embed_known,
+        )
+        self.normalizer = Normalizer(obs_dim, act_dim, config.action_transform)
+
+    @property
+    def device(self) -> th.device:
+        """Where the planner lives."""
+        return self.normalizer.state_mean.device
+
+    def autocast(self) -> AbstractContextManager[object]:
+        """Return the context of ``config.precision`` here; :meth:`loss` and :meth:`plan` enter it themselves."""
+        return autocast(self.config.precision, self.device)
+
+    def fit_normalizer(self, states: th.Tensor, actions: th.Tensor) -> None:
+        """Set the mean and standard deviation that states and (transformed) actions are z-scored with.
+
+        :param states: (M, obs_dim), environment units
+        :param actions: (M, act_dim), in [-1, 1]
+        :raises ValueError: for a wrong shape, no rows, or numbers that are not finite
+        """
+        states, actions = self._tensor(states), self._tensor(actions)
+        _check("states", states, (None, self.obs_dim))
+        _check("actions", actions, (len(states), self.act_dim))
+        self.normalizer.fit(states, actions)
+
+    def loss(
+        self,
+        windows: Windows,
+        delay: th.Tensor | None = None,
+        weight: th.Tensor | None = None,
+        generator: th.Generator | None = None,
+    ) -> th.Tensor:
+        """Return the weighted mean squared error over unknown entries of valid steps (the paper's Algorithm 1).
+
+        :param windows: B windows of ``window_length`` steps, environment units
+        :param delay: (B,) mask lengths; drawn as ``config.mask`` says by default
+        :param weight: (B,) factor of each window's error; 1 by default
+        :param generator: of mask lengths, noise and times; torch's global one by default
+        :return: float32 scalar
+        :raises ValueError: for windows of another shape or delays outside 0..max_delay
+        """
+        config, device = self.config, self.device
+        states, actions = self._tensor(windows.states), self._tensor(windows.actions)
+        _check_shape("windows.states", states, (None, self.window_length, self.obs_dim))
+        n = len(states)
+        _check_shape("windows.actions", actions, (n, self.window_length, self.act_dim))
+        if weight is not None:
+            _check_shape("weight", weight := self._tensor(weight), (n,))
+        if delay is None:
+            delay = inpainting.draw_delays(n, self.max_delay, config.mask, config.mask_end_probability, generator)
+        delay = self._delay(delay, n)
+        valid = windows.valid.to(device)  # (B, L)
+        clean = self._normalize(states, actions)  # (B, L, obs_dim + act_dim)
+        # Steps behind an episode's end repeat its last row: they are neither shown as known nor learned
+        known = inpainting.known_mask(delay, self.window_length, self.obs_dim, self.act_dim) & valid[..., None]
+        noise = self._noise(clean.shape, generator)
+        t = diffusion.draw_times(n, config.schedule, config.time_sampling, generator, device)
+        alpha, sigma = (factor[:, None, None] for factor in diffusion.alpha_sigma(t, config.schedule))
+        x = th.where(known, clean, diffusion.add_noise(clean, noise, alpha, sigma))
+        with self.autocast():
+            network = self.network
+            output = network(x, network.context(clean, known), network.modulations(t), valid)
+        target = diffusion.prediction_target(clean, noise, alpha, sigma, config.prediction)
+        learned = valid[..., None] & ~known
+        error = th.where(learned, (output.float() - target) ** 2, 0.0)
+        if weight is not None:
+            error = error * weight[:, None, None]
+        return error.sum() / learned.sum().clamp(min=1)
+
+    @th.no_grad()
+    def plan(
+        self,
+        observation: th.Tensor,
+        action_history: th.Tensor,
+        delay: th.Tensor,
+        value_fn: ValueFn | None = None,
+        n_candidates: int | None = None,
+        sampling_steps: int | None = None,
+        temperature: float | None = None,
+        noise: th.Tensor | None = None,
+        generator: th.Generator | None = None,
+    ) -> Plan:
+        """Inpaint N candidate windows per decision and choose the one of the highest mean value (MCSS).
+
+        The arguments that default to ``None`` take the config's value. One candidate is enough, and drawn, where the
+        others could not matter: at temperature 0, where all are alike, and by default without a ``value_fn``.
+
+        :param observation: (B, obs_dim) delayed observations s_{t-d}
+        :param action_history: (B, D, act_dim), the D newest actions, oldest first
+        :param delay: (B,) integers d in 0..D, not necessarily alike
+        :param value_fn: maps states (B, N, K, obs_dim) and actions (B, N, K, act_dim), environment units, to values
+            (B, N, K); without it all values are 0 and the first candidate is taken
+        :param n_candidates: N
+        :param sampling_steps: denoising steps
+        :param temperature: factor on the initial noise
+        :param noise: (N, L, obs_dim + act_dim) standard normal initial noise, shared by all decisions, to repeat a plan
+        :param generator: of the initial noise where none is given; torch's global one by default
+        :raises ValueError: for wrong shapes, numbers that are not finite, or delays outside 0..max_delay
+        """
+        config, length = self.config, self.window_length
+        observation, action_history = self._tensor(observation), self._tensor(action_history)
+        _check("observation", observation, (None, self.obs_dim))
+        n = len(observation)
+        _check("action_history", action_history, (n, self.max_delay, self.act_dim))
+        delay = self._delay(delay, n)
+        temperature = config.temperature if temperature is None else temperature
+        shape = (length, self.obs_dim + self.act_dim)
+        if noise is not None:
+            noise = self._tensor(noise)
+            _check("noise", noise, (n_candidates, *shape))
+            n_candidates = len(noise)
+        elif n_candidates is None:
+            n_candidates = 1 if value_fn is None else config.n_candidates
+        if n_candidates < 1 or not temperature >= 0:
+            raise ValueError(
+                f"n_candidates is {n_candidates} and temperature {temperature}, expected at least 1 and at least 0."
+            )
+        n_candidates = n_candidates if temperature > 0 else 1
+        steps = diffusion.solver_steps(
+            config.solver,
+            config.schedule,
+            config.sampling_steps if sampling_steps is None else sampling_steps,
+            config.time_grid,
+        )
+
+        given = inpainting.known_window(observation, action_history, delay, length)  # (B, L, obs_dim + act_dim)
+        known = inpainting.known_mask(delay, length, self.obs_dim, self.act_dim)
+        clean, network = self._normalize(*self._split(given)), self.network
+        if noise is None:
+            noise = self._noise((n, n_candidates, *shape), generator)
+        x = temperature * noise[..., :n_candidates, :, :].expand(n, -1, -1, -1)  # (B, N, L, obs_dim + act_dim)
+        with self.autocast():
+            modulations = network.modulations(th.tensor([step.t for step in steps], device=self.device))
+            context = network.context(clean, known)
+            x = diffusion.solve(
+                lambda x, i: network(x.flatten(0, 1), context, modulations[i : i + 1]).float().view_as(x),
+                x,
+                steps,
+                config.prediction,
+                impose=lambda x: th.where(known[:, None], clean[:, None], x),
+            )
+        # What is given comes back exactly as given, without the rounding of the normaliser
+        states, actions = self._split(x)
+        states, actions = self.normalizer.denormalize_states(states), self.normalizer.denormalize_actions(actions)
+        states, actions = self._split(th.where(known[:, None], given[:, None], th.cat([states, actions], dim=-1)))
+        values = self._values(states, actions, delay, value_fn)  # (B, N)
+        rows = th.arange(n, device=self.device)
+        return Plan(actions[rows, values.argmax(1), delay], states, actions, values)
+
+    def _values(self, states: th.Tensor, actions: th.Tensor, delay: th.Tensor, value_fn: ValueFn | None) -> th.Tensor:
+        """Return the mean value of each candidate's scored states: (B, N)."""
+        if value_fn is None:
+            return th.zeros(states.shape[:2], device=self.device)
+        first = 1 + delay if self.config.scored_states == "future" else th.ones_like(delay)  # (B,)
+        skipped = int(first.min())  # states that no decision scores need no value
+        values = value_fn(states[:, :, skipped:], actions[:, :, skipped:]).float()  # (B, N, L - skipped)
+        if values.shape != (*states.shape[:2], states.shape[2] - skipped):
+            raise ValueError(
+                f"value_fn returned the shape {tuple(values.shape)}, expected one value per state, "
+                f"{(*states.shape[:2], states.shape[2] - skipped)}: drop a last dimension of 1."
+            )
+        if values.isnan().any():
+            raise ValueError("value_fn returned NaN, so that no candidate is the best; check the critic.")
+        steps = th.arange(skipped, states.shape[2], device=self.device)
+        scored = (steps >= first[:, None])[:, None]  # (B, 1, L - skipped)
+        return th.where(scored, values, 0.0).sum(-1) / scored.sum(-1)
+
+    def _split(self, x: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        states, actions = x.split([self.obs_dim, self.act_dim], dim=-1)
+        return states, actions
+
+    def _normalize(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        return th.cat([self.normalizer.normalize_states(states), self.normalizer.normalize_actions(actions)], dim=-1)
+
+    def _noise(self, shape: tuple[int, ...], generator: th.Generator | None) -> th.Tensor:
+        source = self.device if generator is None else generator.device
+        return th.randn(shape, generator=generator, device=source).to(self.device)
+
+    def _tensor(self, values: th.Tensor) -> th.Tensor:
+        return th.as_tensor(values, dtype=th.float32, device=self.device)
+
+    def _delay(self, delay: th.Tensor, batch_size: int) -> th.Tensor:
+        """Return checked delays: (B,) int64 on this planner's device."""
+        delay = th.as_tensor(delay)
+        if delay.shape != (batch_size,) or delay.is_floating_point():
+            raise ValueError(
+                f"delay is {delay.dtype} of the shape {tuple(delay.shape)}, expected integers of the shape "
+                f"({batch_size},), one per decision or window."
+            )
+        if not 0 <= int(delay.min()) <= int(delay.max()) <= self.max_delay:
+            raise ValueError(
+                f"delay runs from {int(delay.min())} to {int(delay.max())}, expected 0..{self.max_delay}: build the "
+                "planner with a larger max_delay."
+            )
+        return delay.to(self.device, th.int64)
+
+
+def _check_shape(name: str, values: th.Tensor, shape: tuple[int | None, ...]) -> None:
+    """Refuse a tensor of another shape; ``None`` stands for any size."""
+    if len(values.shape) != len(shape) or any(
+        want not in (None, have) for have, want in zip(values.shape, shape, strict=True)
+    ):
+        expected = ", ".join("any" if want is None else str(want) for want in shape)
+        raise ValueError(f"{name} has the shape {tuple(values.shape)}, expected ({expected}).")
+    if len(values) == 0:
+        raise ValueError(f"{name} is empty, expected at least one row.")
+
+
+def _check(name: str, values: th.Tensor, shape: tuple[int | None, ...]) -> None:
+    """Refuse a tensor of another shape or with numbers that are not finite."""
+    _check_shape(name, values, shape)
+    if not values.isfinite().all():
+        raise ValueError(f"{name} has entries that are NaN or infinite; find out where they come from first.")

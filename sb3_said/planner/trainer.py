@@ -1,0 +1,321 @@
+"""Training a planner: gradient steps, averaged weights, held-out errors, and resuming bit for bit."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch as th
+
+from sb3_said.common.windows import Windows, WindowSource
+from sb3_said.planner.config import PlannerConfig
+from sb3_said.planner.inpainting import draw_delays
+from sb3_said.planner.planner import InpaintingPlanner
+from sb3_said.planner.yardstick import Present, RegressionYardstick
+
+HELD_OUT_WINDOWS = 256  # per delay, in evaluate()
+YARDSTICK_LEARNING_RATE = 1e-3
+
+
+def learning_rate(step: int, gradient_steps: int, config: PlannerConfig) -> float:
+    """Return the learning rate of update ``step`` = 0, 1, ...: a linear rise, then a cosine down to 0."""
+    if step < config.warmup_steps:
+        return config.learning_rate * (step + 1) / config.warmup_steps
+    progress = (step - config.warmup_steps) / max(1, gradient_steps - config.warmup_steps)
+    return config.learning_rate * (0.5 + 0.5 * math.cos(math.pi * min(1.0, progress)))
+
+
+def ema_decay(step: int, config: PlannerConfig) -> float:
+    """Return the decay of the averaged weights after update ``step`` = 0, 1, ...
+
+    It rises to its full value, because a full-length average still holds mostly initial weights in a short run.
+    """
+    return min(config.ema_decay, (1 + step) / (10 + step))
+
+
+def value_weight(values: th.Tensor, weight_factor: float) -> th.Tensor:
+    """Return exp(beta (V - 1)), the weight of a window whose first state has normalised value V in [0, 1].
+
+    :param values: (B,) V
+    :param weight_factor: beta; 0 weighs all windows alike
+    """
+    return th.exp(weight_factor * (values - 1.0))
+
+
+class PlannerTrainer:
+    """Train a planner on windows of states and actions.
+
+    The weights that gradient steps move belong to the trainer (``online``). The planner handed in holds their
+    exponential moving average after every update, so it can be used, saved and evaluated between any two of them.
+
+    All draws come from a generator of the trainer's own, and on the CPU a run that was saved and resumed ends bit for
+    bit as if it had never stopped (a GPU's attention does not repeat itself exactly). A small regression is trained on
+    the same batches, as the bar for the planner's errors.
+
+    :param planner: trained in place; its normaliser is fitted to the training part of ``source``
+    :param source: windows of the true, undelayed states and the actions
+    :param gradient_steps: updates of the whole training, over which the learning rate falls to 0
+    :param held_out: fraction of the data, in whole episodes, that is kept for ``evaluate``; 0 for none
+    :param seed: of every draw
+    :raises ValueError: when ``source`` does not fit the planner, or cannot be split
+    """
+
+    def __init__(
+        self,
+        planner: InpaintingPlanner,
+        source: WindowSource,
+        gradient_steps: int,
+        held_out: float = 0.05,
+        seed: int = 0,
+    ) -> None:
+        if (source.obs_dim, source.act_dim) != (planner.obs_dim, planner.act_dim):
+            raise ValueError(
+                f"The planner expects {planner.obs_dim} observation and {planner.act_dim} action entries, but the "
+                f"windows have {source.obs_dim} and {source.act_dim}; build the planner for this data."
+            )
+        if gradient_steps < 1 or not 0.0 <= held_out < 1.0:
+            raise ValueError(
+                "Training needs gradient_steps >= 1 and held_out in [0, 1), but they are "
+                f"{gradient_steps} and {held_out}."
+            )
+        self.planner = planner
+        self.config = planner.config
+        self.gradient_steps = gradient_steps
+        self.n_updates = 0
+        self.device = planner.device
+        self.generator = th.Generator().manual_seed(seed)
+        self._settings = _plain(
+            {
+                "config": dataclasses.asdict(planner.config),
+                "gradient_steps": gradient_steps,
+                "held_out": held_out,
+                "seed": seed,
+                "n_windows": len(source),
+            }
+        )
+
+        self.source, held_source = source.split(held_out, seed) if held_out > 0 else (source, None)
+        planner.fit_normalizer(self.source.start_states(), self.source.start_actions())
+        self.online = copy.deepcopy(planner).train().requires_grad_(True)
+        with th.random.fork_rng(devices=[]):  # the initial weights are the only draw that takes no generator
+            th.manual_seed(seed)
+            self.yardstick = RegressionYardstick(planner.obs_dim, planner.act_dim, planner.max_delay).to(self.device)
+        fused = self.device.type in ("cpu", "cuda")
+        self.optimizer = th.optim.AdamW(
+            self.online.parameters(),
+            lr=self.config.learning_rate,
+            betas=self.config.betas,
+            weight_decay=self.config.weight_decay,
+            fused=fused,
+        )
+        self.yardstick_optimizer = th.optim.Adam(self.yardstick.parameters(), lr=YARDSTICK_LEARNING_RATE, fused=fused)
+        self._averaged: list[th.Tensor] = list(planner.parameters())
+        self._online: list[th.Tensor] = list(self.online.parameters())
+        # Read at log times only: a read per update would make a GPU wait for it.
+        self._loss_sums = th.zeros(2, device=self.device)
+        self._n_losses = 0
+        self._bad_update = th.full((), -1, device=self.device)
+        self._held_out = None if held_source is None else self._draw_held_out(held_source, seed)
+
+    def step(self) -> None:
+        """Make one update.
+
+        :raises FloatingPointError: when a loss was not finite (looked at every 100 updates)
+        """
+        config = self.config
+        windows = self._to_device(self.source.sample(config.batch_size, self.planner.window_length, self.generator))
+        delay = draw_delays(
+            config.batch_size, self.planner.max_delay, config.mask, config.mask_end_probability, self.generator
+        )  # (B,)
+        rate = learning_rate(self.n_updates, self.gradient_steps, config)
+        for optimizer, factor in (
+            (self.optimizer, 1.0),
+            (self.yardstick_optimizer, YARDSTICK_LEARNING_RATE / config.learning_rate),
+        ):
+            for group in optimizer.param_groups:
+                group["lr"] = rate * factor
+            optimizer.zero_grad()
+
+        loss = self.online.loss(windows, delay, value_weight(windows.values, config.weight_factor), self.generator)
+        loss.backward()
+        if config.gradient_clip is not None:
+            th.nn.utils.clip_grad_norm_(self._online, config.gradient_clip)
+        self.optimizer.step()
+        with th.no_grad():
+            th._foreach_lerp_(self._averaged, self._online, 1.0 - ema_decay(self.n_updates, config))
+
+        yardstick_loss = self.yardstick.loss(*self._yardstick_batch(windows, delay.to(self.device)))
+        yardstick_loss.backward()
+        self.yardstick_optimizer.step()
+
+        with th.no_grad():
+            self._loss_sums += th.stack((loss.float(), yardstick_loss))
+            is_first_bad = ~loss.isfinite() & (self._bad_update < 0)
+            self._bad_update.masked_fill_(is_first_bad, self.n_updates)
+        self._n_losses += 1
+        self.n_updates += 1
+        if self.n_updates % 100 == 0:
+            self._check_finite()
+
+    def train(
+        self, n_steps: int | None = None, callback: Callable[[PlannerTrainer], bool | None] | None = None
+    ) -> bool:
+        """Make up to ``n_steps`` updates, by default all that are left.
+
+        :param callback: called with the trainer after every update; training stops when it returns False
+        :return: whether it ran to the end
+        """
+        for _ in range(self.gradient_steps - self.n_updates if n_steps is None else n_steps):
+            self.step()
+            if callback is not None and callback(self) is False:
+                return False
+        self._check_finite()
+        return True
+
+    def pop_losses(self) -> dict[str, float]:
+        """Return the mean losses since the last call, and the learning rate of the last update."""
+        self._check_finite()
+        loss, yardstick_loss = (self._loss_sums / max(1, self._n_losses)).tolist()
+        self._loss_sums.zero_()
+        self._n_losses = 0
+        rate = self.optimizer.param_groups[0]["lr"]
+        return {"planner/loss": loss, "planner/loss_mlp": yardstick_loss, "planner/learning_rate": rate}
+
+    @th.no_grad()
+    def evaluate(self) -> dict[str, float]:
+        """Return mean absolute errors on held-out windows, for some delays d from 0 to D.
+
+        ``planner/present_error_d4`` is the error of the decoded s_t at delay 4, in standard deviations of the states;
+        ``planner/action_error_d4`` that of the decision a_t, in environment units; ``..._mlp_d4`` are the
+        regression's. The planner decodes with its averaged weights, one candidate and temperature 0.
+        """
+        self._check_finite()
+        if self._held_out is None:
+            return {}
+        windows, delay = self._held_out
+        batch = self._yardstick_batch(windows, delay)
+        truth, guess = batch[3], self.yardstick(*batch[:3])
+        history = self._action_history(windows.actions, delay)
+        plan = self.planner.plan(windows.states[:, 0], history, delay, temperature=0.0, generator=th.Generator())
+        decoded = plan.states[th.arange(len(delay), device=self.device), 0, delay]
+        metrics = {}
+        for name, present in (
+            ("", Present(self.planner.normalizer.normalize_states(decoded), plan.action)),
+            ("_mlp", Present(guess.state, guess.action.clamp(-1.0, 1.0))),
+        ):
+            state_error = (present.state - truth.state).abs().mean(1)  # (B,)
+            action_error = (present.action - truth.action).abs().mean(1)
+            for d in delay.unique().tolist():
+                metrics[f"planner/present_error{name}_d{d}"] = state_error[delay == d].mean().item()
+                metrics[f"planner/action_error{name}_d{d}"] = action_error[delay == d].mean().item()
+        return metrics
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything a resumed training needs: nested dicts of numbers, strings, lists and tensors (copies)."""
+        self._check_finite()
+        return copy.deepcopy(
+            {
+                "settings": self._settings,
+                "n_updates": self.n_updates,
+                "planner": dict(self.planner.state_dict()),
+                "online": dict(self.online.state_dict()),
+                "yardstick": dict(self.yardstick.state_dict()),
+                "optimizer": _optimizer_state(self.optimizer),
+                "yardstick_optimizer": _optimizer_state(self.yardstick_optimizer),
+                "generator": self.generator.get_state(),
+                "loss_sums": self._loss_sums,
+                "n_losses": self._n_losses,
+            }
+        )
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue where ``state_dict`` was taken.
+
+        :raises ValueError: when that training had other settings, so that the end would be neither's
+        """
+        if state["settings"] != self._settings:
+            saved, given = _flat(state["settings"]), _flat(self._settings)
+            differing = [key for key in sorted(saved | given) if saved.get(key) != given.get(key)]
+            raise ValueError(
+                "Training can only resume with the settings and data it began with, but these differ: "
+                + "; ".join(f"{key} was {saved.get(key)} and is now {given.get(key)}" for key in differing)
+                + ". Resume with the old ones, or start a new training."
+            )
+        state = copy.deepcopy(state)
+        self.n_updates = state["n_updates"]
+        self.planner.load_state_dict(state["planner"])
+        self.online.load_state_dict(state["online"])
+        self.yardstick.load_state_dict(state["yardstick"])
+        _load_optimizer_state(self.optimizer, state["optimizer"])
+        _load_optimizer_state(self.yardstick_optimizer, state["yardstick_optimizer"])
+        self.generator.set_state(state["generator"].cpu())
+        self._loss_sums.copy_(state["loss_sums"])
+        self._n_losses = state["n_losses"]
+        self._bad_update.fill_(-1)
+
+    def _check_finite(self) -> None:
+        bad = int(self._bad_update)
+        if bad >= 0:
+            raise FloatingPointError(
+                f"The planner's loss was not finite in update {bad} (of {self.gradient_steps}). Check the data for "
+                f"infinite values; else lower learning_rate ({self.config.learning_rate}) or lengthen warmup_steps "
+                f"({self.config.warmup_steps})."
+            )
+
+    def _to_device(self, windows: Windows) -> Windows:
+        return Windows(*(part.to(self.device, non_blocking=True) for part in windows))
+
+    def _yardstick_batch(
+        self, windows: Windows, delay: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor, Present, th.Tensor]:
+        index = th.arange(len(delay), device=self.device)
+        states = self.planner.normalizer.normalize_states(windows.states)  # (B, L, obs_dim)
+        present = Present(states[index, delay], windows.actions[index, delay])
+        return states[:, 0], windows.actions, delay, present, windows.valid[index, delay]
+
+    def _action_history(self, actions: th.Tensor, delay: th.Tensor) -> th.Tensor:
+        """Return what an agent would hold: (B, D, act_dim) with the d known actions last."""
+        D = self.planner.max_delay
+        source = th.arange(D, device=self.device) - (D - delay[:, None])  # (B, D): the window's index, < 0 if before it
+        history = actions.gather(1, source.clamp_min(0)[..., None].expand(-1, -1, actions.shape[-1]))
+        return history * (source >= 0)[..., None]
+
+    def _draw_held_out(self, source: WindowSource, seed: int) -> tuple[Windows, th.Tensor] | None:
+        """Return windows of a few delays, and the delay of each: (B,) int64."""
+        D, generator = self.planner.max_delay, th.Generator().manual_seed(seed)
+        starts, delays = [], []
+        for d in [D] if self.config.mask == "fixed" else sorted({round(D * k / 4) for k in range(5)}):
+            long_enough = th.nonzero(source.remaining > d)[:, 0]  # index d, the decision, is in the same episode
+            drawn = th.randperm(len(long_enough), generator=generator)[:HELD_OUT_WINDOWS]
+            starts.append(long_enough[drawn])
+            delays.append(th.full((len(drawn),), d))
+        if not sum(map(len, starts)):
+            return None
+        return (
+            self._to_device(source.gather(th.cat(starts), self.planner.window_length)),
+            th.cat(delays).to(self.device),
+        )
+
+
+def _plain(tree: Any) -> Any:
+    """Turn tuples into lists, so that settings compare equal after a trip through JSON."""
+    if isinstance(tree, dict):
+        return {key: _plain(value) for key, value in tree.items()}
+    return [_plain(value) for value in tree] if isinstance(tree, (list, tuple)) else tree
+
+
+def _flat(settings: dict[str, Any]) -> dict[str, Any]:
+    return {**{key: value for key, value in settings.items() if key != "config"}, **settings["config"]}
+
+
+def _optimizer_state(optimizer: th.optim.Optimizer) -> dict[str, Any]:
+    # The groups are left out: they hold nothing but settings, and tuples. Names are strings, for JSON.
+    return {str(index): state for index, state in optimizer.state_dict()["state"].items()}
+
+
+def _load_optimizer_state(optimizer: th.optim.Optimizer, state: dict[str, Any]) -> None:
+    groups = optimizer.state_dict()["param_groups"]
+    optimizer.load_state_dict({"state": {int(index): part for index, part in state.items()}, "param_groups": groups})
