@@ -1,0 +1,131 @@
+"""SAID's policy: an expert that collects and a planner that answers, behind one ``predict``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, Literal
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+
+from sb3_said.common.buffers import UNDELAYED, check_spaces
+from sb3_said.common.save_util import register_class
+from sb3_said.planner import InpaintingPlanner, PlannerConfig
+from sb3_said.sac.policies import DelayedSACPolicy
+
+Answer = Literal["planner", "expert"]
+
+#: Seed of the candidates' noise when ``deterministic=True``. Any number does; changing it changes every answer.
+NOISE_SEED = 0
+
+
+@register_class
+class SAIDPolicy(DelayedSACPolicy):
+    """The expert's policy with an inpainting planner on top.
+
+    Until the planner is trained the expert answers; after that the planner does, scored by the expert's critics.
+
+    :param planner_kwargs: fields of :class:`~sb3_said.planner.PlannerConfig`
+    :param policy_kwargs: of :class:`~sb3_said.sac.DelayedSACPolicy`
+    :raises ValueError: for an unknown planner setting, or a delayed task whose critics do not read the true state
+    """
+
+    planner_updates: th.Tensor
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        *,
+        planner_kwargs: dict[str, Any] | None = None,
+        **policy_kwargs: Any,
+    ):
+        super().__init__(observation_space, action_space, lr_schedule, **policy_kwargs)
+        if self.replay_space is not None and not self.delay_reconciled_critic:
+            raise ValueError(
+                "SAID scores planned states with the expert's critics, which must read true states; "
+                "leave delay_reconciled_critic=True."
+            )
+        state_space, max_delay = check_spaces(observation_space, action_space)
+        self.planner_kwargs = planner_kwargs or {}
+        with th.random.fork_rng(devices=[]):  # the expert learns as it would without a planner
+            self.planner = InpaintingPlanner(
+                state_space.shape[0], action_space.shape[0], max_delay, PlannerConfig(**self.planner_kwargs)
+            )
+        self.planner.requires_grad_(False)
+        self.register_buffer("planner_updates", th.zeros(()))
+        self._answer: Answer | None = None
+
+    @property
+    def planner_is_trained(self) -> bool:
+        """Whether the planner has been trained, and so answers."""
+        return bool(self.planner_updates > 0)
+
+    @contextmanager
+    def answering(self, who: Answer) -> Iterator[None]:
+        """Let the planner or the expert answer ``predict`` for a while, whichever would otherwise.
+
+        :param who: ``"planner"`` or ``"expert"``
+        :raises ValueError: for another name, or for a planner that is not trained
+        """
+        if who not in ("planner", "expert"):
+            raise ValueError(f"Only the 'planner' or the 'expert' can answer, got {who!r}.")
+        if who == "planner" and not self.planner_is_trained:
+            raise ValueError("The planner is not trained yet; call learn() or train_planner() first.")
+        before, self._answer = self._answer, who
+        try:
+            yield
+        finally:
+            self._answer = before
+
+    def value(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """Return min over the critics of Q(s, a), which scores candidates (MCSS) and bootstraps trajectory weights.
+
+        :param states: (..., obs_dim)
+        :param actions: (..., act_dim) in [-1, 1]
+        :return: (...)
+        """
+        flat: PyTorchObs = states.flatten(0, -2)
+        if self.replay_space is not None:
+            flat = {UNDELAYED: flat}
+        return th.cat(self.critic(flat, actions.flatten(0, -2)), dim=1).amin(1).view(states.shape[:-1])
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        who = self._answer or ("planner" if self.planner_is_trained else "expert")
+        if who == "expert":
+            return super()._predict(observation, deterministic)
+        if not isinstance(observation, dict):
+            n, act_dim = len(observation), self.planner.act_dim
+            observation = {
+                "observation": observation,
+                "action_history": observation.new_zeros(n, 0, act_dim),
+                "delay": observation.new_zeros(n, 1),
+            }
+        if not deterministic:
+            return self._plan(observation)
+        # Each row alone: matrix products of another batch size round differently, which can change the candidate chosen.
+        rows = ({key: value[i : i + 1] for key, value in observation.items()} for i in range(len(observation["delay"])))
+        return th.cat([self._plan(row, noise=self._fixed_noise()) for row in rows])
+
+    def _plan(self, observation: dict[str, th.Tensor], noise: th.Tensor | None = None) -> th.Tensor:
+        """Return the decision of each row: (B, act_dim)."""
+        delay = observation["delay"][:, 0].round().long()
+        return self.planner.plan(
+            observation["observation"], observation["action_history"], delay, value_fn=self.value, noise=noise
+        ).action
+
+    def _fixed_noise(self) -> th.Tensor:
+        """Return the same noise at every call, without touching the global random state: (N, L, obs_dim + act_dim)."""
+        planner = self.planner
+        shape = (planner.config.n_candidates, planner.window_length, planner.obs_dim + planner.act_dim)
+        return th.randn(shape, generator=th.Generator().manual_seed(NOISE_SEED))
+
+    def set_training_mode(self, mode: bool) -> None:
+        super().set_training_mode(mode)
+        self.planner.train(mode)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**super()._get_constructor_parameters(), "planner_kwargs": self.planner_kwargs}

@@ -1,0 +1,137 @@
+"""SAID: a delay-aware expert collects, a diffusion planner trained on its replay answers."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+
+from sb3_said.planner.trainer import PlannerTrainer
+from sb3_said.sac import DelayedSAC
+from sb3_said.said.callbacks import PlannerTrainingCallback
+from sb3_said.said.policies import SAIDPolicy
+
+SelfSAID = TypeVar("SelfSAID", bound="SAID")
+
+
+class SAID(DelayedSAC):
+    """State-Action Inpainting Diffuser, online (paper, Algorithm 2).
+
+    ``learn`` runs the expert (SADR), then trains a diffusion transformer on windows of its replay buffer. ``predict``
+    asks the expert until the planner is trained, and the planner from then on: it inpaints what the delay hides and the
+    plan behind it, many times, and the critics choose. Collection always uses the expert.
+
+    :param policy: ``"MultiInputPolicy"`` or ``"MlpPolicy"``, which name the same class
+    :param env: a task in a ``DelayedObservationWrapper``, or one with a 1-D Box observation (delay 0)
+    :param learning_rate: of the expert
+    :param planner_kwargs: fields of :class:`~sb3_said.planner.PlannerConfig`
+    :param planner_gradient_steps: updates of one planner training; the paper makes 1,000,000
+    :param planner_train_freq: also train the planner every so many environment steps; by default only at the end (paper)
+    :param planner_newest_fraction: train on the newest part of the buffer only (the paper's 20 % is 0.2)
+    :param sac_kwargs: every other argument of :class:`~sb3_said.sac.DelayedSAC` and of SB3's ``SAC``
+    :raises ValueError: as ``DelayedSAC`` does, and for planner settings outside their range
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": SAIDPolicy, "MultiInputPolicy": SAIDPolicy}
+    policy: SAIDPolicy
+
+    def __init__(
+        self,
+        policy: str | type[SAIDPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 3e-4,
+        *,
+        planner_kwargs: dict[str, Any] | None = None,
+        planner_gradient_steps: int = 20_000,
+        planner_train_freq: int | None = None,
+        planner_newest_fraction: float = 1.0,
+        **sac_kwargs: Any,
+    ):
+        for name, value in (("gradient_steps", planner_gradient_steps), ("train_freq", planner_train_freq)):
+            if value is not None and value < 1:
+                raise ValueError(f"planner_{name} must be at least 1, got {value}.")
+        if not 0.0 < planner_newest_fraction <= 1.0:
+            raise ValueError(f"planner_newest_fraction is a part of the buffer in (0, 1], got {planner_newest_fraction}.")
+        self.planner_kwargs = planner_kwargs
+        self.planner_gradient_steps = planner_gradient_steps
+        self.planner_train_freq = planner_train_freq
+        self.planner_newest_fraction = planner_newest_fraction
+        super().__init__(policy, env, learning_rate, **sac_kwargs)
+
+    def _policy_flags(self) -> dict[str, Any]:
+        return {**super()._policy_flags(), "planner_kwargs": self.planner_kwargs}
+
+    def learn(
+        self: SelfSAID,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 4,
+        tb_log_name: str = "SAID",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfSAID:
+        """Run the expert for ``total_timesteps``, then train the planner on what it stored.
+
+        A :class:`PlannerTrainingCallback` among the callbacks is used for the planner; otherwise one is added.
+        """
+        callbacks = as_callback_list(callback)
+        if not any(isinstance(c, PlannerTrainingCallback) for c in callbacks):
+            callbacks.append(PlannerTrainingCallback(progress_bar=progress_bar))
+        return super().learn(
+            total_timesteps, callbacks, log_interval, tb_log_name, reset_num_timesteps, progress_bar  # type: ignore[arg-type]
+        )
+
+    def make_planner_trainer(self, gradient_steps: int | None = None) -> PlannerTrainer:
+        """Return a trainer of this agent's planner on its replay buffer.
+
+        :param gradient_steps: ``planner_gradient_steps`` by default
+        :raises ValueError: when the buffer is empty, as it is after ``load``
+        """
+        source = self.replay_buffer.window_source(
+            self.planner_newest_fraction, self.gamma, value_fn=self._stored_values, env=self._vec_normalize_env
+        )
+        return PlannerTrainer(
+            self.policy.planner, source, gradient_steps or self.planner_gradient_steps, seed=self.seed or 0
+        )
+
+    def train_planner(self, gradient_steps: int | None = None, progress_bar: bool = False) -> None:
+        """Train the planner on the replay buffer as it is, without running the expert.
+
+        :param gradient_steps: ``planner_gradient_steps`` by default
+        :param progress_bar: show one
+        :raises ValueError: when the buffer is empty
+        """
+        callback = PlannerTrainingCallback(progress_bar=progress_bar)
+        if not hasattr(self, "_logger"):
+            self._setup_learn(0, callback, reset_num_timesteps=False)
+        callback.init_callback(self)
+        callback.train_planner(gradient_steps)
+
+    def _stored_values(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        states = self._vec_normalize_env.normalize_obs(states) if self._vec_normalize_env else states
+        with th.no_grad():
+            return self.policy.value(*(th.as_tensor(x, device=self.device) for x in (states, actions))).cpu().numpy()
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        with self.policy.answering("expert"):
+            return super()._sample_action(learning_starts, action_noise, n_envs)
+
+
+def as_callback_list(callback: MaybeCallback) -> list[BaseCallback]:
+    """Return callbacks in SB3's many forms as a list of callback objects."""
+    from stable_baselines3.common.callbacks import ConvertCallback
+
+    if callback is None:
+        return []
+    if isinstance(callback, CallbackList):
+        return list(callback.callbacks)
+    if isinstance(callback, (list, tuple)):
+        return list(callback)
+    return [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]
