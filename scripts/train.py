@@ -1,0 +1,85 @@
+"""Train SAID or one of its baselines on a delayed task, with rl_zoo3's command line."""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import sys
+from pathlib import Path
+
+import rl_zoo3.train
+from zoo import ALGORITHMS, PRESETS, DelayedExperimentManager, Run, default_preset, read_arguments
+
+EXAMPLES = """
+examples:
+  python scripts/train.py --algo said --env Hopper-v5 --delay 4
+  python scripts/train.py --algo said --env Ant-v5 --delay 8 --preset paper --seed 1
+  python scripts/train.py --algo sadr --env HalfCheetah-v5 --delay 0 8 -n 300000 -P
+  python scripts/train.py --resume logs/said/Hopper-v5-delay4_1
+
+Runs go to LOG_FOLDER/ALGO/ENV-delayN_K (-f sets LOG_FOLDER); scripts/evaluate.py and scripts/enjoy.py take that folder.
+Below: the options of rl_zoo3, all of which work here.
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the options that rl_zoo3 does not have."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter, add_help=False
+    )
+    parser.add_argument("-h", "--help", action="store_true", help="show this help, then that of rl_zoo3")
+    parser.add_argument("--algo", choices=list(ALGORITHMS), default="said", help="default: said")
+    parser.add_argument(
+        "--delay",
+        type=int,
+        nargs="+",
+        default=[],
+        metavar="STEPS",
+        help="age of observations in control steps; two numbers: drawn anew from LOW..HIGH each episode; default: no delay",
+    )
+    parser.add_argument(
+        "--preset",
+        choices=PRESETS,
+        default=default_preset(),
+        help="cpu: hours on two cores; paper: the paper's table; quick, smoke: minutes (default here: %(default)s)",
+    )
+    parser.add_argument(
+        "--checkpoint-freq",
+        type=int,
+        default=25_000,
+        metavar="STEPS",
+        help="steps between checkpoints (default: 25000)",
+    )
+    parser.add_argument("--resume", type=Path, metavar="RUN_DIR", help="go on with a run from its last checkpoint")
+    return parser
+
+
+def main(argv: list[str]) -> None:
+    """Train as the command line says."""
+    options, zoo_argv = parser().parse_known_args(argv)
+    if options.help:
+        parser().print_help()
+    if options.resume is not None:
+        argv = [*read_arguments(options.resume), *without_resume(argv)]
+        resume, (options, zoo_argv) = options.resume, parser().parse_known_args(argv)
+        options.resume = resume
+    if len(options.delay) > 2 or any(x < 0 for x in options.delay):
+        parser().error(f"--delay takes N, or LOW HIGH, all >= 0; got {options.delay}")
+    run = Run(argv, options.delay, options.preset, options.checkpoint_freq, options.resume)
+    rl_zoo3.train.ExperimentManager = functools.partial(DelayedExperimentManager, run)  # type: ignore[misc,assignment]
+    sys.argv = [sys.argv[0], "--algo", options.algo, *zoo_argv, *(["--help"] if options.help else [])]
+    rl_zoo3.train.train()
+
+
+def without_resume(argv: list[str]) -> list[str]:
+    """Return a command line without ``--resume RUN_DIR``."""
+    kept, skip = [], False
+    for word in argv:
+        if not (skip or word == "--resume" or word.startswith("--resume=")):
+            kept.append(word)
+        skip = word == "--resume"
+    return kept
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,176 @@
+"""What the command lines share: our algorithms and delays inside rl_zoo3's ``ExperimentManager``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch as th
+import yaml
+from rl_zoo3 import ALGOS
+from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
+from rl_zoo3.utils import get_latest_run_id
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import CallbackList
+from stable_baselines3.common.logger import Logger, make_output_format
+
+from sb3_said import SAID, DelayedSAC, PlannerTrainingCallback
+from sb3_said.common.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback, restore_training
+
+CONFIGS = Path(__file__).resolve().parent.parent / "zoo_configs"
+ARGUMENTS_NAME = "train_args.json"
+WRAPPER = "sb3_said.delays.DelayedObservationWrapper"
+
+#: What each name on the command line is: a class and the flags that make it so.
+ALGORITHMS: dict[str, tuple[type[DelayedSAC], dict[str, bool]]] = {
+    "said": (SAID, {}),
+    "sac": (DelayedSAC, {"augment_state": False, "delay_reconciled_critic": False}),
+    "sa": (DelayedSAC, {"augment_state": True, "delay_reconciled_critic": False}),
+    "dr": (DelayedSAC, {"augment_state": False, "delay_reconciled_critic": True}),
+    "sadr": (DelayedSAC, {"augment_state": True, "delay_reconciled_critic": True}),
+}
+for _name, (_class, _) in ALGORITHMS.items():
+    ALGOS[_name] = _class
+    HYPERPARAMS_SAMPLER[_name] = HYPERPARAMS_SAMPLER["sac"]
+    HYPERPARAMS_CONVERTER[_name] = HYPERPARAMS_CONVERTER["sac"]
+
+PRESETS = ("cpu", "paper", "smoke", "quick")
+
+
+def config_file(algo: str) -> Path:
+    """Return the YAML file of an algorithm; SAC, SA, DR and SADR share one."""
+    return CONFIGS / ("said.yml" if algo == "said" else "delayed_sac.yml")
+
+
+def default_preset() -> str:
+    """Return ``paper`` where there is a GPU to run it on, ``cpu`` elsewhere."""
+    return "paper" if th.cuda.is_available() else "cpu"
+
+
+def preset_overrides(config: str | Path, preset: str, env_id: str) -> dict[str, Any]:
+    """Return what a preset changes for a task: its own entry of ``presets:`` in the file, or the preset's default.
+
+    ``cpu`` is what the file says outside ``presets:``, so that rl_zoo3 alone reads it too.
+
+    :raises ValueError: for a preset the file does not have
+    """
+    if preset == "cpu":
+        return {}
+    presets = (yaml.safe_load(Path(config).read_text()) or {}).get("presets", {})
+    if preset not in presets:
+        raise ValueError(f"{config} has no preset '{preset}', only {['cpu', *presets]}.")
+    return dict(presets[preset].get(env_id, presets[preset]["default"]))
+
+
+@dataclass(frozen=True)
+class Run:
+    """What our command line adds to rl_zoo3's.
+
+    :param argv: the command line, so that a resumed run can be set up as it was
+    :param delay: one number, or low and high, in control steps; empty for no wrapper
+    :param preset: see ``preset_overrides``
+    :param checkpoint_freq: environment steps between checkpoints
+    :param resume: folder of the run to continue
+    """
+
+    argv: list[str]
+    delay: list[int]
+    preset: str
+    checkpoint_freq: int
+    resume: Path | None = None
+
+    @property
+    def delay_name(self) -> str:
+        """Name of the delay in paths, e.g. ``-delay4`` or ``-delay0-8``."""
+        return "".join(f"-{x}" for x in self.delay).replace("-", "-delay", 1)
+
+
+class DelayedExperimentManager(ExperimentManager):
+    """rl_zoo3's manager with delays, presets and resumable runs.
+
+    :param run: what our command line adds
+    :param args: rl_zoo3's parsed arguments, then its own parameters
+    """
+
+    def __init__(self, run: Run, args: argparse.Namespace, algo: str, env_id: str, *zoo_args: Any, **zoo_kwargs: Any):
+        zoo_kwargs["config"] = zoo_kwargs.get("config") or str(config_file(algo))
+        super().__init__(args, algo, env_id, *zoo_args, **zoo_kwargs)
+        self.run = run
+        name = f"{self.env_name}{run.delay_name}"
+        run_id = get_latest_run_id(self.log_path, name) + 1
+        self.save_path = str(run.resume or Path(self.log_path) / f"{name}_{run_id}")
+        if zoo_kwargs.get("uuid_str") and run.resume is None:
+            self.save_path += zoo_kwargs["uuid_str"]
+        self.params_path = f"{self.save_path}/{self.env_name}"
+
+        overrides = preset_overrides(self.config, run.preset, env_id)
+        overrides |= ALGORITHMS[algo][1]
+        if run.delay:
+            overrides["env_wrapper"] = [{WRAPPER: {"delay": run.delay[0] if len(run.delay) == 1 else list(run.delay)}}]
+        self.custom_hyperparams = {**overrides, **(self.custom_hyperparams or {})}
+
+    @property
+    def checkpoint(self) -> Path:
+        """File that a killed run goes on from."""
+        return Path(self.save_path) / CHECKPOINT_NAME
+
+    def create_log_folder(self) -> None:
+        super().create_log_folder()
+        self.monitor_kwargs["override_existing"] = not self.checkpoint.exists()
+        seed = [] if "--seed" in self.run.argv else ["--seed", str(self.seed)]
+        (Path(self.save_path) / ARGUMENTS_NAME).write_text(json.dumps([*self.run.argv, *seed]))
+
+    def create_callbacks(self) -> None:
+        super().create_callbacks()
+        self.callbacks.append(TrainingCheckpointCallback(self.save_path, self.run.checkpoint_freq))
+        if self.algo == "said":
+            self.callbacks.append(PlannerTrainingCallback(folder=self.save_path, progress_bar=self.show_progress))
+
+    def learn(self, model: BaseAlgorithm) -> None:
+        """Train, from the last checkpoint if there is one; Ctrl-C ends the training and keeps what was learned.
+
+        :param model: newly made
+        """
+        resumes = self.checkpoint.exists()
+        if resumes:
+            restore_training(model, self.checkpoint, CallbackList(self.callbacks))  # type: ignore[arg-type]
+            print(f"Resuming {self.save_path} at step {model.num_timesteps}")
+        model.set_logger(self._logger(model))
+        try:
+            model.learn(
+                max(self.n_timesteps - model.num_timesteps, 0),
+                callback=self.callbacks,
+                log_interval=self.log_interval if self.log_interval > -1 else 4 if self.log_interval == -1 else None,
+                reset_num_timesteps=not resumes,
+            )
+        except KeyboardInterrupt:
+            print(f"Interrupted at step {model.num_timesteps}; go on with --resume {self.save_path}")
+        finally:
+            if model.env is not None:
+                model.env.close()
+
+    def _logger(self, model: BaseAlgorithm) -> Logger:
+        """Log to the screen, to progress.csv (one file per resume) and to TensorBoard if asked for."""
+        suffix = f"_{model.num_timesteps}" if model.num_timesteps > 0 else ""
+        formats = [make_output_format("csv", self.save_path, suffix)]
+        if self.verbose > 0:
+            formats.append(make_output_format("stdout", self.save_path))
+        if self.tensorboard_log is not None:
+            formats.append(make_output_format("tensorboard", f"{self.tensorboard_log}/{Path(self.save_path).name}"))
+        return Logger(self.save_path, formats)
+
+
+def read_arguments(run_dir: Path) -> list[str]:
+    """Return the command line that a run was started with.
+
+    :raises ValueError: when the folder holds no run
+    """
+    path = run_dir / ARGUMENTS_NAME
+    if not path.exists():
+        sys.exit(f"{run_dir} holds no run: {path} is missing. Give the folder that train.py printed as 'Log path'.")
+    return list(json.loads(path.read_text()))
