@@ -1,0 +1,55 @@
+# make install   the virtual environment .venv, with everything
+# make train     trains SAID on a MuJoCo task under delay, evaluates it beside its expert and draws a plot
+# make test      lint, types and tests: what CI runs
+# make format    rewrites the code as `make lint` wants it
+
+VENV := .venv
+PY := $(VENV)/bin/python
+# The first interpreter that runs and can make environments; PYTHON=/path/to/python overrides it.
+PYTHON ?= $(firstword $(foreach p,python3.13 python3.12 python3.11 python3.10 python3,\
+	$(shell $(p) -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 10))' >/dev/null 2>&1 && echo $(p))))
+
+ALGO := said
+ENV := InvertedPendulum-v5
+DELAY := 4
+PRESET := quick
+LOGS := logs
+EPISODES := 20
+
+.PHONY: install train test lint type pytest format clean
+
+install: $(VENV)/.installed
+
+# The stamp is newer than its inputs once everything is installed, so a second `make install` does nothing.
+$(VENV)/.installed: setup.cfg pyproject.toml constraints.txt scripts/install_torch.sh
+	@test -x $(PY) || test -n "$(PYTHON)" || { echo "No Python >= 3.10 with venv found: make install PYTHON=/path/to/python"; exit 1; }
+	test -x $(PY) || $(PYTHON) -m venv $(VENV)
+	scripts/install_torch.sh $(PY)
+	$(PY) -m pip install -c constraints.txt -e ".[all]"
+	touch $@
+
+train: install
+	$(PY) scripts/train.py --algo $(ALGO) --env $(ENV) --delay $(DELAY) --preset $(PRESET) -f $(LOGS)
+	run=$$(ls -td $(LOGS)/$(ALGO)/*/ | head -n 1) && \
+	$(PY) scripts/evaluate.py "$$run" --episodes $(EPISODES) --plot "$$run/evaluation.png"
+
+test: lint type pytest
+
+lint: install
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+
+type: install
+	$(PY) -m mypy
+
+# One thread a worker: the tests' networks are small, and workers that share cores slow each other down.
+pytest: install
+	OMP_NUM_THREADS=1 $(PY) -m pytest -n 2
+
+format: install
+	$(PY) -m ruff check --fix .
+	$(PY) -m ruff format .
+
+clean:
+	rm -rf build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	find sb3_said scripts tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,171 @@
+"""Plots of training and evaluation, drawn without a display."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from sb3_said.evaluation.statistics import Summary, bootstrap_interval
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+# Okabe and Ito's palette: told apart by colour-blind readers too.
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+
+# Column of progress.csv that counts the planner's updates.
+UPDATES = "planner/n_updates"
+
+
+def panels(n: int = 1, width: float = 5.0, height: float = 3.6) -> list[Axes]:
+    """Make a figure of n panels side by side.
+
+    :param n: panels
+    :param width: of each panel, inches
+    :param height: inches
+    :raises ImportError: without matplotlib
+    """
+    try:
+        from matplotlib.figure import Figure  # no pyplot: needs no display, and leaves the caller's backend alone
+    except ImportError as error:
+        raise ImportError('Plots need matplotlib: pip install "sb3_said[plots]"') from error
+    axes = Figure(figsize=(n * width, height), dpi=150, layout="constrained").subplots(1, n, squeeze=False)[0]
+    for ax in axes:
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.grid(axis="y", alpha=0.3)
+        ax.set_axisbelow(True)
+    return list(axes)
+
+
+def save(ax: Axes, path: str | Path) -> None:
+    """Write the figure of ``ax``; the file's suffix names the format (.png, .pdf, .svg)."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure = ax.get_figure(root=True)
+    assert figure is not None  # for mypy: axes of `panels` have one
+    figure.savefig(path)
+
+
+def plot_learning_curve(run: str | Path, ax: Axes | None = None, window: int = 20) -> Axes:
+    """Plot the returns of training, and of the evaluations beside it, over environment steps.
+
+    :param run: folder with ``*.monitor.csv`` (SB3's Monitor), ``evaluations.npz`` (SB3's EvalCallback), or both
+    :param ax: to draw on; a new figure by default
+    :param window: training episodes in the running mean
+    :raises ValueError: when the folder holds neither file
+    """
+    run = Path(run)
+    steps, returns = _read_monitors(sorted(run.glob("*monitor.csv")))
+    evaluations = run / "evaluations.npz"
+    if not len(steps) and not evaluations.is_file():
+        raise ValueError(f"{run} holds neither episodes in *.monitor.csv nor evaluations.npz; give a training run.")
+    ax = panels()[0] if ax is None else ax
+    if len(steps):
+        window = min(window, len(returns))
+        mean = np.convolve(returns, np.full(window, 1 / window), mode="valid")
+        ax.plot(steps, returns, ".", color=COLORS[0], alpha=0.2, markersize=3, markeredgewidth=0)
+        ax.plot(steps[window - 1 :], mean, color=COLORS[0], label=f"training, mean of {window} episodes")
+    if evaluations.is_file():
+        with np.load(evaluations) as file:
+            eval_steps, results = file["timesteps"], file["results"]
+        intervals = [bootstrap_interval(row) for row in results]
+        ax.plot(eval_steps, [i.value for i in intervals], color=COLORS[1], marker="o", markersize=3, label="evaluation")
+        ax.fill_between(
+            eval_steps, [i.low for i in intervals], [i.high for i in intervals], color=COLORS[1], alpha=0.2, linewidth=0
+        )
+    ax.set_xlabel("environment steps")
+    ax.set_ylabel("return of an episode (undiscounted)")
+    ax.legend(frameon=False)
+    return ax
+
+
+def plot_returns(summaries: Sequence[Summary], ax: Axes | None = None) -> Axes:
+    """Plot every episode's return, and the mean with its interval, one column for each summary.
+
+    :param summaries: for instance the planner's and the expert's, in the order of the columns
+    :param ax: to draw on; a new figure by default
+    """
+    ax = panels(width=1.6 + 1.4 * len(summaries))[0] if ax is None else ax
+    for column, summary in enumerate(summaries):
+        color = COLORS[column % len(COLORS)]
+        mean = summary.mean_return
+        n = len(summary.returns)
+        # Spread evenly, not at random, so that the same evaluation draws the same picture.
+        ax.plot(
+            column + np.linspace(-0.25, 0.25, n) if n > 1 else [column],
+            summary.returns, "o", color=color, alpha=0.3, markersize=4, markeredgewidth=0,
+        )  # fmt: skip
+        ax.errorbar(
+            column, mean.value, yerr=[[mean.value - mean.low], [mean.high - mean.value]],
+            fmt="D", color=color, capsize=5, markersize=6,
+        )  # fmt: skip
+        ax.annotate(f"{mean.value:,.0f}", (column, mean.value), (9, 5), textcoords="offset points", color=color)
+    ax.set_xticks(range(len(summaries)), [f"{s.label}\n{len(s.returns)} episodes" for s in summaries])
+    ax.set_xlim(-0.6, len(summaries) - 0.4)
+    ax.set_ylabel("return of an episode (undiscounted)")
+    return ax
+
+
+def plot_planner_errors(progress: str | Path, kind: Literal["present", "action"], ax: Axes | None = None) -> Axes:
+    """Plot how far the planner is off on held-out windows, beside an MLP regression trained on the same windows.
+
+    One colour for each delay d; solid lines are the planner's ``planner/{kind}_error_d*``, dashed ones the MLP's
+    ``planner/{kind}_error_mlp_d*``. A planner above its dashed line is not trained yet.
+
+    :param progress: SB3's ``progress.csv``
+    :param kind: "present", the error of the decoded present state in standard deviations of the states; or "action",
+        the error of the decision in environment units
+    :param ax: to draw on; a new figure by default
+    :raises ValueError: when the file holds no such error
+    """
+    rows = list(csv.DictReader(Path(progress).read_text().splitlines()))
+    pattern = re.compile(rf"planner/{kind}_error(_mlp)?_d(\d+)")
+    columns = {key: match for key in (rows[0] if rows else {}) if (match := pattern.fullmatch(key))}
+    if not columns:
+        raise ValueError(
+            f"{progress} has no column planner/{kind}_error_d*; give the progress.csv of a planner's training."
+        )
+    ax = panels()[0] if ax is None else ax
+    # Over both kinds, so that a delay has the same colour in both plots.
+    delays = sorted({int(d) for key in rows[0] for d in re.findall(r"planner/\w+_error(?:_mlp)?_d(\d+)", key)})
+    updates = _running_total([float(row.get(UPDATES) or 0.0) for row in rows])
+    for column, match in sorted(columns.items(), key=lambda item: (int(item[1][2]), item[0])):
+        points = [(x, float(row[column])) for x, row in zip(updates, rows, strict=True) if row[column]]
+        ax.plot(
+            *zip(*points, strict=True),
+            color=COLORS[delays.index(int(match[2])) % len(COLORS)],
+            linestyle="--" if match[1] else "-",
+            label=f"{'MLP' if match[1] else 'planner'}, d = {match[2]}",
+        )
+    ax.set_xlabel("planner updates")
+    unit = {"present": "standard deviations", "action": "environment units"}[kind]
+    ax.set_ylabel(f"{kind}{'-state' if kind == 'present' else ''} error ({unit})")
+    ax.set_ylim(bottom=0)
+    ax.legend(frameon=False, fontsize="small")
+    return ax
+
+
+def _running_total(counts: Sequence[float]) -> list[float]:
+    """Join counts that start anew with each training into one count."""
+    total, last, joined = 0.0, 0.0, []
+    for count in counts:
+        total += max(last, 0.0) if count < last else 0.0
+        joined.append(total + count)
+        last = count
+    return joined
+
+
+def _read_monitors(files: Sequence[Path]) -> tuple[np.ndarray, np.ndarray]:
+    """Return environment steps and returns of all episodes in the order of time, (n,) each."""
+    episodes = []
+    for file in files:
+        lines = file.read_text().splitlines()[1:]  # the first line is a JSON comment
+        episodes += [(float(row["t"]), int(float(row["l"])), float(row["r"])) for row in csv.DictReader(lines)]
+    episodes.sort()
+    lengths = np.array([length for _, length, _ in episodes], np.int64)
+    return np.cumsum(lengths), np.array([reward for *_, reward in episodes])

@@ -1,0 +1,213 @@
+"""Whole episodes from seeded resets, with batched decisions, and the time decisions take."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import gymnasium as gym
+import numpy as np
+
+from sb3_said.evaluation.statistics import Latency
+
+Observation = Any  # one array, or a dict of arrays; batched with a leading axis where a docstring says (B, ...)
+State = tuple[np.ndarray, ...] | None
+
+
+class Model(Protocol):
+    """What is asked of a model: the ``predict`` of Stable-Baselines3."""
+
+    def predict(
+        self,
+        observation: Observation,
+        state: State = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, State]:
+        """Answer a batch of observations (B, ...) with actions (B, act_dim)."""
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """What ``rollout`` measured."""
+
+    returns: np.ndarray
+    """(n_episodes,) float64, sum of the environment's own rewards, in the order of the reset seeds"""
+    lengths: np.ndarray
+    """(n_episodes,) int64, in control steps"""
+    call_seconds: np.ndarray
+    """(n_calls,) float64, wall time of each call of ``predict``"""
+    batch_sizes: np.ndarray
+    """(n_calls,) int64, decisions made by each call"""
+
+
+class _Slot:
+    """One environment and the episode it is playing."""
+
+    def __init__(self, env: gym.Env[Any, Any]):
+        self.env = env
+        self.observation: Observation = None
+        self.episode = -1
+        self.starting = True
+
+    def start(self, episode: int, seed: int) -> None:
+        self.observation, _ = self.env.reset(seed=seed + episode)
+        self.episode = episode
+        self.starting = True
+
+
+def rollout(
+    model: Model,
+    env: str | Callable[[], gym.Env[Any, Any]],
+    n_episodes: int,
+    seed: int,
+    n_envs: int = 1,
+    deterministic: bool = True,
+    normalize: Callable[[Observation], Observation] | None = None,
+    on_step: Callable[[gym.Env[Any, Any]], None] | None = None,
+    on_episode: Callable[[int, float, int], None] | None = None,
+) -> Rollout:
+    """Play whole episodes; episode i starts from ``reset(seed=seed + i)``.
+
+    The environments step in lock-step, so that one call of ``predict`` decides for all of them. The next episode goes
+    to the first environment that is free; one without a further episode leaves the batch. Hence exactly
+    ``n_episodes`` episodes are played and counted, short ones are not over-represented, and returns do not depend on
+    ``n_envs`` as long as ``predict`` answers each row by itself (batched arithmetic may still differ in the last bits).
+
+    :param model: anything with the ``predict`` of Stable-Baselines3
+    :param env: an environment id, or a function that makes an environment
+    :param n_episodes: >= 1
+    :param seed: reset seed of episode 0; take seeds that training and tuning never saw
+    :param n_envs: environments in lock-step, >= 1; the first decision of a call uses as many of them
+    :param deterministic: handed to ``predict``
+    :param normalize: applied to batched observations before ``predict``, such as ``VecNormalize.normalize_obs``
+    :param on_step: called with the environment after every step, for instance to render it
+    :param on_episode: called with (episode, return, length) after every episode, in the order in which they end
+    :raises ValueError: when ``n_episodes`` or ``n_envs`` is not positive
+    """
+    if n_episodes < 1 or n_envs < 1:
+        raise ValueError(f"n_episodes and n_envs must be at least 1, got n_episodes={n_episodes}, n_envs={n_envs}.")
+    make_env = (lambda: gym.make(env)) if isinstance(env, str) else env
+    returns, lengths = np.zeros(n_episodes), np.zeros(n_episodes, np.int64)
+    call_seconds: list[float] = []
+    batch_sizes: list[int] = []
+    envs = [make_env() for _ in range(min(n_envs, n_episodes))]
+    try:
+        slots = [_Slot(e) for e in envs]
+        for episode, slot in enumerate(slots):
+            slot.start(episode, seed)
+        next_episode = len(slots)
+        state: State = None
+        while slots:
+            batch = _stack([slot.observation for slot in slots])
+            batch = batch if normalize is None else normalize(batch)
+            episode_start = np.array([slot.starting for slot in slots])
+
+            began = time.perf_counter()
+            actions, state = model.predict(batch, state=state, episode_start=episode_start, deterministic=deterministic)
+            call_seconds.append(time.perf_counter() - began)
+            batch_sizes.append(len(slots))
+
+            playing = []
+            for row, slot in enumerate(slots):
+                slot.observation, reward, terminated, truncated, _ = slot.env.step(actions[row])
+                slot.starting = False
+                returns[slot.episode] += float(reward)
+                lengths[slot.episode] += 1
+                if on_step is not None:
+                    on_step(slot.env)
+                if terminated or truncated:
+                    if on_episode is not None:
+                        on_episode(slot.episode, float(returns[slot.episode]), int(lengths[slot.episode]))
+                    if next_episode == n_episodes:
+                        continue
+                    slot.start(next_episode, seed)
+                    next_episode += 1
+                playing.append(row)
+            if len(playing) < len(slots):
+                state = _keep_rows(model, state, playing)
+                slots = [slots[row] for row in playing]
+    finally:
+        for e in envs:
+            e.close()
+    return Rollout(returns, lengths, np.array(call_seconds), np.array(batch_sizes, np.int64))
+
+
+def collect_observations(env: str | Callable[[], gym.Env[Any, Any]], n_observations: int, seed: int) -> Observation:
+    """Gather observations along random actions, to time decisions on.
+
+    :param env: an environment id, or a function that makes an environment
+    :param n_observations: how many, >= 1
+    :param seed: of the resets and the actions
+    :return: (n_observations, ...), a dict of such arrays for a dict space
+    """
+    made = gym.make(env) if isinstance(env, str) else env()
+    made.action_space.seed(seed)
+    observation, _ = made.reset(seed=seed)
+    observations = [observation]
+    while len(observations) < n_observations:
+        observation, _, terminated, truncated, _ = made.step(made.action_space.sample())
+        if terminated or truncated:
+            observation, _ = made.reset()
+        observations.append(observation)
+    made.close()
+    return _stack(observations)
+
+
+def measure_latency(
+    model: Model,
+    observations: Observation,
+    n_calls: int = 200,
+    deterministic: bool = True,
+    normalize: Callable[[Observation], Observation] | None = None,
+) -> Latency:
+    """Time single decisions, from a NumPy observation to a NumPy action, as a control loop asks for them.
+
+    One call warms up and is not counted; every call after it is, slow ones included. The state that ``predict``
+    returns is handed to the next call.
+
+    :param model: anything with the ``predict`` of Stable-Baselines3
+    :param observations: (M, ...), or a dict of such arrays; call i is asked about observation i mod M
+    :param n_calls: >= 1
+    :param deterministic: handed to ``predict``
+    :param normalize: applied to observations (1, ...) inside the measured time
+    :raises ValueError: when ``n_calls`` is not positive
+    """
+    if n_calls < 1:
+        raise ValueError(f"n_calls must be at least 1, got {n_calls}.")
+    n_observations = len(next(iter(observations.values())) if isinstance(observations, dict) else observations)
+    seconds = np.empty(n_calls + 1)
+    state: State = None
+    for call in range(-1, n_calls):
+        observation = _row(observations, call % n_observations)
+        began = time.perf_counter()
+        if normalize is not None:
+            observation = normalize(observation)
+        _, state = model.predict(
+            observation, state=state, episode_start=np.array([call == -1]), deterministic=deterministic
+        )
+        seconds[call + 1] = time.perf_counter() - began
+    return Latency.from_seconds(seconds[1:])
+
+
+def _row(observations: Observation, row: int) -> Observation:
+    """Cut one observation (1, ...) out of a batch."""
+    if isinstance(observations, dict):
+        return {key: value[row : row + 1] for key, value in observations.items()}
+    return observations[row : row + 1]
+
+
+def _stack(observations: list[Observation]) -> Observation:
+    if isinstance(observations[0], dict):
+        return {key: np.stack([o[key] for o in observations]) for key in observations[0]}
+    return np.stack(observations)
+
+
+def _keep_rows(model: Model, state: State, rows: list[int]) -> State:
+    """Keep the rows of the environments that go on; sb3_contrib's recurrent states have the layer axis first."""
+    if state is None:
+        return None
+    axis = 1 if hasattr(getattr(model, "policy", None), "lstm_actor") else 0
+    return tuple(np.take(array, rows, axis=axis) for array in state)

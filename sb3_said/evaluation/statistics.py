@@ -1,0 +1,157 @@
+"""Intervals, percentiles and the summary of an evaluation that is written to disk."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A statistic of a sample and its bootstrap interval.
+
+    ``low`` and ``high`` are NaN for a single value: one episode says nothing about the spread.
+    """
+
+    value: float
+    low: float
+    high: float
+    confidence: float
+    n: int
+
+    def __str__(self) -> str:
+        return f"{self.value:.1f} [{self.low:.1f}, {self.high:.1f}]"
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Percentiles of the time of single decisions, in milliseconds."""
+
+    p50_ms: float
+    p95_ms: float
+    p99_ms: float
+    max_ms: float
+    n_calls: int
+
+    @classmethod
+    def from_seconds(cls, seconds: npt.ArrayLike) -> Latency:
+        """Summarise call times.
+
+        :param seconds: (n_calls,), not empty
+        :raises ValueError: for no calls
+        """
+        milliseconds = 1e3 * np.asarray(seconds, dtype=np.float64)
+        if milliseconds.size == 0:
+            raise ValueError("Percentiles need at least one measured call, got none.")
+        p50, p95, p99 = np.percentile(milliseconds, [50, 95, 99])
+        return cls(float(p50), float(p95), float(p99), float(milliseconds.max()), milliseconds.size)
+
+    def __str__(self) -> str:
+        return f"p50 {self.p50_ms:.2f} ms, p95 {self.p95_ms:.2f} ms, p99 {self.p99_ms:.2f} ms"
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What one row of an evaluation says: who answered, how well, how fast."""
+
+    label: str
+    mean_return: Interval
+    mean_length: Interval
+    latency: Latency | None
+    returns: list[float]
+    lengths: list[int]
+
+    @classmethod
+    def from_episodes(
+        cls, label: str, returns: npt.ArrayLike, lengths: npt.ArrayLike, latency: Latency | None = None
+    ) -> Summary:
+        """Summarise whole episodes.
+
+        :param label: who answered, such as "planner" or "expert"
+        :param returns: (n_episodes,)
+        :param lengths: (n_episodes,), in control steps
+        :param latency: of single decisions, if it was measured
+        """
+        return cls(
+            label=label,
+            mean_return=bootstrap_interval(returns),
+            mean_length=bootstrap_interval(lengths),
+            latency=latency,
+            returns=[float(x) for x in np.asarray(returns)],
+            lengths=[int(x) for x in np.asarray(lengths)],
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what ``json.dump`` takes; NaN becomes None, since JSON has no NaN."""
+        return {key: _without_nan(value) for key, value in asdict(self).items()}
+
+
+def iqm(values: np.ndarray, axis: int = -1) -> np.ndarray:
+    """Interquartile mean: the mean of the values left after dropping a quarter at each end (rounded down).
+
+    :param values: at least one value along ``axis``
+    :param axis: to reduce
+    """
+    n = values.shape[axis]
+    middle = np.sort(values, axis=axis).take(range(n // 4, n - n // 4), axis=axis)
+    return np.asarray(middle.mean(axis=axis))
+
+
+def bootstrap_interval(
+    values: npt.ArrayLike,
+    statistic: Callable[..., Any] = np.mean,
+    confidence: float = 0.95,
+    n_resamples: int = 10_000,
+    seed: int = 0,
+) -> Interval:
+    """Bias-corrected and accelerated (BCa) bootstrap interval of a statistic.
+
+    Returns of control tasks are skewed, a few falls far below many good episodes, which BCa corrects for and the plain
+    percentile interval does not. ``scipy.stats.bootstrap`` gives the same; this spares users the dependency.
+
+    :param values: (n,), independent: one per episode of one agent, or one per training seed
+    :param statistic: of (..., n) along ``axis=-1``, such as ``np.mean`` or ``iqm``
+    :param confidence: probability that the interval is to cover, in (0, 1)
+    :param n_resamples: bootstrap samples
+    :param seed: of the resampling; fixed, so that the same episodes give the same interval
+    :raises ValueError: for no values, values that are not finite, or a confidence outside (0, 1)
+    """
+    sample = np.asarray(values, dtype=np.float64).ravel()
+    n = len(sample)
+    if n == 0 or not np.all(np.isfinite(sample)):
+        raise ValueError(f"An interval needs at least one value and only finite ones, got {sample}.")
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence is a probability strictly between 0 and 1, got {confidence}.")
+    value = float(statistic(sample, axis=-1))
+    if n == 1:
+        return Interval(value, math.nan, math.nan, confidence, n)
+    if np.all(sample == sample[0]):
+        return Interval(value, value, value, confidence, n)
+
+    rng = np.random.default_rng(seed)
+    resampled = np.sort(statistic(sample[rng.integers(0, n, (n_resamples, n))], axis=-1))
+    leave_one_out = sample[np.nonzero(~np.eye(n, dtype=bool))[1]].reshape(n, n - 1)
+    deviations = statistic(leave_one_out, axis=-1)
+    deviations = deviations.mean() - deviations
+
+    # Efron (1987): the bias correction z0, the acceleration a, and the percentiles they move the bounds to.
+    normal = NormalDist()
+    below = np.mean(resampled < value) + 0.5 * np.mean(resampled == value)
+    z0 = normal.inv_cdf(float(np.clip(below, 1 / (n_resamples + 1), n_resamples / (n_resamples + 1))))
+    spread = np.sum(deviations**2)
+    a = float(np.sum(deviations**3) / (6 * spread**1.5)) if spread > 0 else 0.0
+    z = [z0 + normal.inv_cdf(p) for p in ((1 - confidence) / 2, (1 + confidence) / 2)]
+    low, high = np.quantile(resampled, [normal.cdf(z0 + zi / (1 - a * zi)) for zi in z])
+    return Interval(value, float(low), float(high), confidence, n)
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(v) for key, v in value.items()}
+    return None if isinstance(value, float) and math.isnan(value) else value

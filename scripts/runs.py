@@ -1,0 +1,193 @@
+"""Open a trained agent and its task again, from an rl_zoo3 log folder or a single file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import rl_zoo3
+import yaml
+from gymnasium import spaces
+from rl_zoo3.utils import get_saved_hyperparams, get_wrapper_class
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from zoo import ALGOS
+
+from sb3_said.evaluation.rollout import Observation
+
+DELAY_WRAPPER = "sb3_said.delays.DelayedObservationWrapper"
+
+
+@dataclass(frozen=True)
+class Run:
+    """A trained agent, ready to play."""
+
+    model: BaseAlgorithm
+    make_env: Callable[[], gym.Env[Any, Any]]
+    """makes the task as it was trained on, delay included"""
+    normalize: Callable[[Observation], Observation] | None
+    """VecNormalize's frozen normalisation of batched observations, where training used it"""
+    folder: Path
+    """of the run, for results"""
+    info: dict[str, Any]
+    """what was loaded, in JSON types: algo, env, delay, file, trained_steps"""
+
+
+def load_run(
+    path: str | Path,
+    algo: str | None = None,
+    env_id: str | None = None,
+    delay: int | None = None,
+    device: str = "auto",
+    env_kwargs: dict[str, Any] | None = None,
+) -> Run:
+    """Open a run.
+
+    A run folder's YAML is read the way rl_zoo3 reads it, which can run code: open only folders that you trust. A
+    ``.zip`` on its own, outside a run folder, is opened by its algorithm's ``load`` alone.
+
+    :param path: a run folder such as ``logs/said/Hopper-v5-delay4_1``, or an agent's ``.zip``
+    :param algo: name of the algorithm; read from the run folder where there is one
+    :param env_id: task to play; the one of the run folder by default
+    :param delay: observation delay to play under, in control steps; the trained one by default
+    :param device: torch device
+    :param env_kwargs: more arguments for ``gymnasium.make``, such as ``render_mode``
+    :raises ValueError: when the files do not say what to load, or the agent does not fit the task
+    """
+    file, params = _find(Path(path))
+    hyperparams, args = _read_params(params)
+    algo = algo or args.get("algo")
+    env_id = env_id or getattr(args.get("env"), "gym_id", args.get("env"))
+    algos: dict[str, type[BaseAlgorithm]] = {**rl_zoo3.ALGOS, **ALGOS}
+    if algo not in algos:
+        raise ValueError(f"The algorithm of {file} is not known ({algo}): give --algo, one of {', '.join(algos)}.")
+    if env_id is None:
+        raise ValueError(f"The task of {file} is not known, since no run folder is around it: give --env.")
+    for key in ("frame_stack", "vec_env_wrapper"):
+        if hyperparams.get(key):
+            raise ValueError(f"{file} was trained with {key}={hyperparams[key]}, which cannot be played here.")
+
+    model = algos[algo].load(file, device=device)
+    wrappers = hyperparams.get("env_wrapper") or []
+    wrappers = list(wrappers) if isinstance(wrappers, list) else [wrappers]
+    if delay is not None or params is None:
+        wrappers = _with_delay(wrappers, delay, model)
+    wrap = get_wrapper_class({"env_wrapper": wrappers}) if wrappers else None
+    kwargs = {**hyperparams.get("env_kwargs", {}), **(args.get("env_kwargs") or {}), **(env_kwargs or {})}
+
+    def make_env() -> gym.Env[Any, Any]:
+        env: gym.Env[Any, Any] = gym.make(env_id, **kwargs)
+        return env if wrap is None else wrap(env)
+
+    env = make_env()
+    _check_spaces(model, env, file)
+    max_delay = getattr(env.get_wrapper_attr("process"), "max_delay", 0) if env.has_wrapper_attr("process") else 0
+    env.close()
+    info = {
+        "algo": algo,
+        "env": env_id,
+        "delay": max_delay if delay is None else delay,
+        "file": str(file),
+        "trained_steps": model.num_timesteps,
+    }
+    return Run(model, make_env, _load_normalize(params, hyperparams, make_env), file.parent, info)
+
+
+def answers(model: BaseAlgorithm) -> list[str]:
+    """Return who can answer for a model by name: SAID's expert, and its planner once that is trained."""
+    if not hasattr(model.policy, "answering"):
+        return []
+    return ["planner", "expert"] if model.policy.planner_is_trained else ["expert"]
+
+
+def answering(model: BaseAlgorithm, answer: str | None) -> AbstractContextManager[Any]:
+    """Let one of ``answers(model)`` answer inside the context; None leaves the model as it is.
+
+    :raises ValueError: for another answer
+    """
+    if answer is None:
+        return nullcontext()
+    if answer not in answers(model):
+        raise ValueError(
+            f"This {type(model).__name__} cannot answer as {answer!r}: only a SAID agent has an expert, "
+            "and a planner once that is trained."
+        )
+    context: AbstractContextManager[Any] = model.policy.answering(answer)  # type: ignore[operator]
+    return context
+
+
+def _find(path: Path) -> tuple[Path, Path | None]:
+    """Return the agent's file, and the folder of its run's YAML if it lies in a run folder."""
+    if path.is_file():
+        params = sorted(path.parent.glob("*/args.yml"))
+        return path, params[0].parent if len(params) == 1 else None
+    if not path.is_dir():
+        raise ValueError(f"{path} does not exist; give a run folder such as logs/said/Hopper-v5-delay4_1 or a .zip.")
+    params = sorted(path.glob("*/args.yml"))
+    if len(params) != 1:
+        runs = sorted(str(p.parents[1]) for p in path.glob("**/args.yml"))
+        hint = f"it holds the runs {', '.join(runs)}" if runs else "rl_zoo3 makes one with every training"
+        raise ValueError(f"{path} is not a run folder with one */args.yml: {hint}.")
+    candidates = [path / f"{params[0].parent.name}.zip", path / "best_model.zip"]
+    for file in candidates:
+        if file.is_file():
+            return file, params[0].parent
+    raise ValueError(f"{path} has no finished agent: neither {candidates[0].name} nor {candidates[1].name}.")
+
+
+def _read_params(params: Path | None) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return a run's hyper-parameters and command-line arguments; empty without a run folder."""
+    if params is None:
+        return {}, {}
+    hyperparams, _ = get_saved_hyperparams(str(params), test_mode=True)
+    # rl_zoo3 writes Python objects into this file, so that no safe loader reads it.
+    args = yaml.load((params / "args.yml").read_text(), Loader=yaml.UnsafeLoader)
+    return dict(hyperparams), dict(args)
+
+
+def _with_delay(wrappers: list[Any], delay: int | None, model: BaseAlgorithm) -> list[Any]:
+    """Set the delay to play under, keeping the length of the action history that the model reads."""
+    space = model.observation_space
+    if not isinstance(space, spaces.Dict) or "action_history" not in space.spaces:
+        if delay:
+            raise ValueError(
+                f"This agent reads {space}, not delayed observations: it cannot play with --delay {delay}."
+            )
+        return wrappers
+    max_delay = space["action_history"].shape[0]  # type: ignore[index]  # a Box has a shape
+    if delay is not None and not 0 <= delay <= max_delay:
+        raise ValueError(f"This agent was built for delays 0..{max_delay}, got --delay {delay}.")
+    kwargs = {"delay": max_delay if delay is None else delay, "max_delay": max_delay}
+    names = [next(iter(w)) if isinstance(w, dict) else w for w in wrappers]
+    delayed = [str(name).endswith("DelayedObservationWrapper") for name in names]
+    if not any(delayed):
+        return [*wrappers, {DELAY_WRAPPER: kwargs}]
+    return [
+        {name: {**(w[name] if isinstance(w, dict) else {}), **kwargs}} if is_delay else w
+        for w, name, is_delay in zip(wrappers, names, delayed, strict=True)
+    ]
+
+
+def _check_spaces(model: BaseAlgorithm, env: gym.Env[Any, Any], file: Path) -> None:
+    def shapes(space: spaces.Space[Any]) -> Any:
+        return {key: s.shape for key, s in space.spaces.items()} if isinstance(space, spaces.Dict) else space.shape
+
+    for what in ("observation_space", "action_space"):
+        expected, given = shapes(getattr(model, what)), shapes(getattr(env, what))
+        if expected != given:
+            raise ValueError(f"{file} expects {what} shapes {expected}, the task has {given}: check --env and --delay.")
+
+
+def _load_normalize(
+    params: Path | None, hyperparams: dict[str, Any], make_env: Callable[[], gym.Env[Any, Any]]
+) -> Callable[[Observation], Observation] | None:
+    if params is None or not hyperparams.get("normalize"):
+        return None
+    statistics = VecNormalize.load(str(params / "vecnormalize.pkl"), DummyVecEnv([make_env]))
+    statistics.close()
+    statistics.training = False
+    return statistics.normalize_obs

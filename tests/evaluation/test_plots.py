@@ -1,0 +1,82 @@
+"""Plots are drawn from the files that SB3 writes, and say what is missing."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sb3_said.evaluation import Summary, plots
+
+PNG = b"\x89PNG"
+
+
+@pytest.fixture
+def png(tmp_path: Path) -> Path:
+    pytest.importorskip("matplotlib")
+    return tmp_path / "plots" / "plot.png"
+
+
+def drawn(path: Path) -> bool:
+    return path.read_bytes()[:4] == PNG and path.stat().st_size > 5000
+
+
+def write_monitor(folder: Path, rank: int, rows: list[tuple[float, int, float]]) -> None:
+    lines = ['#{"t_start": 0.0, "env_id": "None"}', "r,l,t", *(f"{r},{n},{t}" for r, n, t in rows)]
+    (folder / f"{rank}.monitor.csv").write_text("\n".join(lines) + "\n")
+
+
+def test_learning_curve(tmp_path: Path, png: Path) -> None:
+    with pytest.raises(ValueError, match="neither"):
+        plots.plot_learning_curve(tmp_path)
+    write_monitor(tmp_path, 0, [(10.0 + i, 50, 2.0 * i) for i in range(30)])
+    write_monitor(tmp_path, 1, [(-5.0, 20, 1.5 + 2.0 * i) for i in range(30)])
+    np.savez(tmp_path / "evaluations.npz", timesteps=[500, 1000], results=np.random.default_rng(0).normal(size=(2, 5)))
+    ax = plots.plot_learning_curve(tmp_path)
+    steps, returns = ax.lines[0].get_data()
+    # Two environments, in the order of time: 50 and 20 steps in turn.
+    np.testing.assert_array_equal(steps[:4], [50, 70, 120, 140])
+    np.testing.assert_array_equal(returns[:4], [10.0, -5.0, 11.0, -5.0])
+    plots.save(ax, png)
+    assert drawn(png)
+
+
+def test_returns_of_planner_and_expert(png: Path) -> None:
+    rng = np.random.default_rng(0)
+    rows = [Summary.from_episodes(name, rng.normal(size=n), [1] * n) for name, n in (("planner", 20), ("expert", 1))]
+    ax = plots.plot_returns(rows)
+    assert [label.get_text().split("\n")[0] for label in ax.get_xticklabels()] == ["planner", "expert"]
+    plots.save(ax, png)
+    assert drawn(png)
+
+
+def test_planner_errors(tmp_path: Path, png: Path) -> None:
+    progress = tmp_path / "progress.csv"
+    progress.write_text(
+        "rollout/ep_rew_mean,planner/present_error_d4,planner/present_error_mlp_d4,planner/action_error_d4,"
+        "planner/action_error_mlp_d4,planner/n_updates\n"
+        "1.0,,,,,\n"
+        ",0.9,0.5,0.4,0.3,100\n"
+        ",,,,,150\n"
+        ",0.6,0.4,0.3,0.2,200\n"
+        "2.0,,,,,200\n"
+        ",0.5,0.4,0.2,0.2,100\n"  # a second training counts from zero again
+    )
+    left, right = plots.panels(2)
+    assert len(plots.plot_planner_errors(progress, "present", left).lines) == 2
+    plots.plot_planner_errors(progress, "action", right)
+    np.testing.assert_array_equal(right.lines[0].get_xydata(), [[100, 0.4], [200, 0.3], [300, 0.2]])
+    assert [line.get_label() for line in right.lines] == ["planner, d = 4", "MLP, d = 4"]
+    plots.save(left, png)
+    assert drawn(png)
+    progress.write_text("rollout/ep_rew_mean\n1.0\n")
+    with pytest.raises(ValueError, match="no column"):
+        plots.plot_planner_errors(progress, "present")
+
+
+def test_without_matplotlib_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(ImportError, match=r"sb3_said\[plots\]"):
+        plots.panels()

@@ -1,0 +1,167 @@
+"""Rollouts: against a hand-written loop, independent of the number of environments, exact in what they count."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sb3_said.evaluation import collect_observations, measure_latency, rollout
+
+SEED = 1000
+
+
+class Countdown(gym.Env):
+    """Episodes of 1..30 steps, drawn at reset; the reward adds what the agent says, so returns tell agents apart."""
+
+    made = 0
+    closed = 0
+
+    def __init__(self) -> None:
+        self.observation_space = gym.spaces.Box(-1, 1, (2,))
+        self.action_space = gym.spaces.Box(-1, 1, (1,))
+        type(self).made += 1
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.left = int(self.np_random.integers(1, 31))
+        return self._observe(), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self.left -= 1
+        return self._observe(), float(action[0]) + self.left, self.left == 0, False, {}
+
+    def _observe(self) -> np.ndarray:
+        return self.np_random.uniform(-1, 1, 2).astype(np.float32)
+
+    def close(self) -> None:
+        type(self).closed += 1
+
+
+class AsDict(gym.ObservationWrapper):
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.observation_space = gym.spaces.Dict(observation=env.observation_space)
+
+    def observation(self, observation: np.ndarray) -> dict[str, np.ndarray]:
+        return {"observation": observation}
+
+
+class Model:
+    """Sums what it has seen in an episode, in its state: it notices when rows are mixed up or starts are missed."""
+
+    def __init__(self) -> None:
+        self.batches: list[int] = []
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        x = observation["observation"] if isinstance(observation, dict) else observation
+        memory = np.zeros(len(x)) if state is None else state[0]
+        assert memory.shape == episode_start.shape == (len(x),)
+        memory = np.where(episode_start, 0.0, memory) + x[:, 0]
+        self.batches.append(len(x))
+        return np.tanh(memory)[:, None], (memory,)
+
+
+def by_hand(n_episodes: int) -> tuple[list[float], list[int]]:
+    returns, lengths = [], []
+    for episode in range(n_episodes):
+        env, total, memory, length = Countdown(), 0.0, 0.0, 0
+        observation, _ = env.reset(seed=SEED + episode)
+        done = False
+        while not done:
+            memory += float(observation[0])  # the model's memory is float64
+            observation, reward, done, _, _ = env.step(np.array([np.tanh(memory)]))
+            total, length = total + reward, length + 1
+        returns.append(total)
+        lengths.append(length)
+    return returns, lengths
+
+
+@pytest.mark.parametrize("n_envs", [1, 3, 8, 50])
+@pytest.mark.parametrize("as_dict", [False, True])
+def test_returns_are_those_of_a_loop_by_hand_whatever_the_number_of_environments(n_envs: int, as_dict: bool) -> None:
+    model = Model()
+    result = rollout(model, (lambda: AsDict(Countdown())) if as_dict else Countdown, 13, SEED, n_envs)
+    returns, lengths = by_hand(13)
+    np.testing.assert_allclose(result.returns, returns, rtol=1e-12)
+    np.testing.assert_array_equal(result.lengths, lengths)
+    # Every decision belongs to an episode that counts: no environment is stepped for nothing.
+    assert sum(model.batches) == sum(lengths) == result.batch_sizes.sum()
+    assert model.batches == result.batch_sizes.tolist()
+    assert max(model.batches) == min(n_envs, 13)
+    assert result.call_seconds.shape == result.batch_sizes.shape and np.all(result.call_seconds > 0)
+
+
+def test_environments_that_are_done_leave_the_batch() -> None:
+    model = Model()
+    result = rollout(model, Countdown, 4, SEED, n_envs=4)
+    still_playing = [int(np.sum(result.lengths > t)) for t in range(result.lengths.max())]
+    assert model.batches == still_playing and model.batches[-1] < 4
+
+
+def test_hooks_normalisation_and_closing() -> None:
+    Countdown.made = Countdown.closed = 0
+    steps, ends = [], []
+    result = rollout(
+        Model(), Countdown, 5, SEED, n_envs=2, normalize=lambda x: 0.0 * x, on_step=steps.append,
+        on_episode=lambda *end: ends.append(end),
+    )  # fmt: skip
+    assert len(steps) == result.lengths.sum()
+    assert sorted(ends) == [(i, result.returns[i], result.lengths[i]) for i in range(5)]
+    # Zeroed observations silence the agent: only the countdown is left.
+    np.testing.assert_allclose(result.returns, [n * (n - 1) / 2 for n in result.lengths])
+    assert Countdown.made == Countdown.closed == 2
+
+
+def test_a_registered_task_by_its_id() -> None:
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.evaluation import evaluate_policy
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    model = PPO("MlpPolicy", "CartPole-v1", seed=0, device="cpu")
+    ours = rollout(model, "CartPole-v1", 3, SEED, n_envs=2)
+    env = DummyVecEnv([lambda: gym.make("CartPole-v1")])
+    for episode in range(3):
+        env.seed(SEED + episode)
+        theirs, lengths = evaluate_policy(model, env, 1, return_episode_rewards=True, warn=False)
+        assert ours.returns[episode] == theirs[0] and ours.lengths[episode] == lengths[0]
+
+
+@pytest.mark.parametrize(("n_episodes", "n_envs"), [(0, 1), (1, 0)])
+def test_rollout_refuses_counts_below_one(n_episodes: int, n_envs: int) -> None:
+    with pytest.raises(ValueError, match="at least 1"):
+        rollout(Model(), Countdown, n_episodes, SEED, n_envs)
+
+
+def test_recurrent_states_of_sb3_contrib_are_cut_along_their_second_axis() -> None:
+    class Lstm(Model):
+        class policy:
+            lstm_actor = object()
+
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            action, (memory,) = super().predict(observation, state and (state[0][1],), episode_start)
+            return action, (np.stack([0 * memory, memory]),)  # (n_layers=2, n_envs)
+
+    result = rollout(Lstm(), Countdown, 7, SEED, n_envs=3)
+    np.testing.assert_allclose(result.returns, by_hand(7)[0], rtol=1e-12)
+
+
+def test_latency_counts_every_call_but_the_warm_up() -> None:
+    class Slow(Model):
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            import time
+
+            time.sleep((0.05, 0.02, 0.0, 0.0)[min(len(self.batches), 3)])  # warm-up, first measured call, the rest
+            return super().predict(observation, state, episode_start)
+
+    model = Slow()
+    observations = collect_observations(lambda: AsDict(Countdown()), 7, seed=0)
+    assert observations["observation"].shape == (7, 2)
+    latency = measure_latency(model, observations, n_calls=20)
+    assert latency.n_calls == 20 and model.batches == [1] * 21
+    assert 0 < latency.p50_ms <= latency.p95_ms <= latency.p99_ms <= latency.max_ms
+    assert latency.p50_ms < 15 and 20 <= latency.max_ms
+    with pytest.raises(ValueError, match="at least 1"):
+        measure_latency(model, observations, n_calls=0)

@@ -1,0 +1,195 @@
+"""Schedules, predictions and solvers against closed forms and against diffusers."""
+
+import math
+
+import numpy as np
+import pytest
+import torch as th
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sb3_said.planner import diffusion
+
+MEAN, STD = th.tensor([2.0, -1.0, 0.3], dtype=th.float64), th.tensor([0.5, 1.5, 0.05], dtype=th.float64)
+
+
+def gaussian_predictor(steps, prediction):
+    """The optimal prediction for clean data N(MEAN, STD^2), in closed form."""
+
+    def predict(x, i):
+        alpha, sigma = steps[i].alpha, steps[i].sigma
+        clean = MEAN + alpha * STD**2 / (alpha**2 * STD**2 + sigma**2) * (x - alpha * MEAN)
+        noise = (x - alpha * clean) / sigma
+        return {"x0": clean, "epsilon": noise, "v": alpha * noise - sigma * clean}[prediction]
+
+    return predict
+
+
+def solve_gaussian(x, n_steps, solver="ddim", schedule="cosine", prediction="v", time_grid="uniform"):
+    steps = diffusion.solver_steps(solver, schedule, n_steps, time_grid)
+    return diffusion.solve(gaussian_predictor(steps, prediction), x, steps, prediction)
+
+
+def exact_gaussian(x, schedule):
+    """The exact flow of N(MEAN, STD^2) from the end time to the start time: it maps quantiles to quantiles."""
+    times = th.tensor([diffusion.END_TIMES[schedule], diffusion.START_TIME], dtype=th.float64)
+    (alpha_1, alpha_0), (sigma_1, sigma_0) = diffusion.alpha_sigma(times, schedule)
+    std_1, std_0 = (alpha_1**2 * STD**2 + sigma_1**2).sqrt(), (alpha_0**2 * STD**2 + sigma_0**2).sqrt()
+    return alpha_0 * MEAN + std_0 / std_1 * (x - alpha_1 * MEAN)
+
+
+@pytest.mark.parametrize("schedule", diffusion.SCHEDULES)
+def test_schedules_preserve_the_variance_and_go_from_clean_to_noise(schedule):
+    t = th.linspace(diffusion.START_TIME, diffusion.END_TIMES[schedule], 100)
+    alpha, sigma = diffusion.alpha_sigma(t, schedule)
+    th.testing.assert_close(alpha**2 + sigma**2, th.ones(100))
+    assert (alpha.diff() < 0).all() and (sigma.diff() > 0).all()
+    assert alpha[0] > 0.9999 and 0.005 < alpha[-1] < 0.01
+
+
+def test_linear_schedule_matches_the_numbers_of_the_paper_code():
+    alpha, sigma = diffusion.alpha_sigma(th.tensor([1e-3, 1.0]), "linear")
+    np.testing.assert_allclose(alpha, [0.99995, 0.00657], rtol=5e-4)
+    np.testing.assert_allclose(sigma, [0.0105, 0.99998], rtol=5e-3)
+
+
+@pytest.mark.parametrize("prediction", diffusion.PREDICTIONS)
+@given(
+    t=st.floats(diffusion.START_TIME, 0.99),
+    clean=st.floats(-5, 5),
+    noise=st.floats(-5, 5),
+    schedule=st.sampled_from(diffusion.SCHEDULES),
+)
+def test_predictions_give_back_what_the_sample_was_made_of(prediction, t, clean, noise, schedule):
+    clean, noise, t = (th.tensor(value, dtype=th.float64) for value in (clean, noise, t))
+    alpha, sigma = diffusion.alpha_sigma(t, schedule)
+    x = diffusion.add_noise(clean, noise, alpha, sigma)
+    target = diffusion.prediction_target(clean, noise, alpha, sigma, prediction)
+    th.testing.assert_close(diffusion.to_clean(target, x, alpha, sigma, prediction), clean, atol=1e-9, rtol=1e-9)
+    th.testing.assert_close(diffusion.to_noise(target, x, alpha, sigma, prediction), noise, atol=1e-9, rtol=1e-9)
+
+
+@pytest.mark.parametrize("time_sampling", diffusion.TIME_SAMPLINGS)
+@pytest.mark.parametrize("schedule", diffusion.SCHEDULES)
+def test_training_times_fill_their_range(time_sampling, schedule):
+    t = diffusion.draw_times(20_000, schedule, time_sampling, th.Generator().manual_seed(0))
+    low, high = diffusion.START_TIME, diffusion.END_TIMES[schedule]
+    assert t.dtype == th.float32 and t.min() >= low and t.max() <= high
+    fraction = (t - low) / (high - low)
+    logit = (fraction / (1 - fraction)).log()
+    spread = logit.std() if time_sampling == "logit_normal" else fraction.std() * math.sqrt(12)
+    assert spread.item() == pytest.approx(1.0, abs=0.03) and fraction.mean().item() == pytest.approx(0.5, abs=0.01)
+
+
+@pytest.mark.parametrize("schedule", diffusion.SCHEDULES)
+def test_time_grids_are_uniform_in_what_they_say(schedule):
+    grid = diffusion.solver_times(8, schedule, "uniform")
+    np.testing.assert_allclose(np.diff(grid), (diffusion.START_TIME - diffusion.END_TIMES[schedule]) / 8)
+    grid = diffusion.solver_times(8, schedule, "log_snr")
+    alpha, sigma = diffusion.alpha_sigma(th.tensor(grid, dtype=th.float64), schedule)
+    gaps = (alpha / sigma).log().diff()
+    th.testing.assert_close(gaps, gaps.mean().expand(8), rtol=1e-3, atol=0.0)
+    assert (grid[0], grid[-1]) == pytest.approx((diffusion.END_TIMES[schedule], diffusion.START_TIME))
+
+
+def oracle_levels(n_steps, schedule, time_grid):
+    times = th.tensor(diffusion.solver_times(n_steps, schedule, time_grid), dtype=th.float64)
+    return diffusion.alpha_sigma(times, schedule)
+
+
+@pytest.mark.parametrize("prediction", diffusion.PREDICTIONS)
+@pytest.mark.parametrize("schedule", diffusion.SCHEDULES)
+def test_ddim_takes_the_steps_of_diffusers(schedule, prediction):
+    diffusers = pytest.importorskip("diffusers")
+    n_steps = 7
+    alpha, _ = oracle_levels(n_steps, schedule, "uniform")
+    scheduler = diffusers.DDIMScheduler(
+        num_train_timesteps=n_steps + 1,
+        clip_sample=False,
+        set_alpha_to_one=False,
+        prediction_type={"v": "v_prediction", "epsilon": "epsilon", "x0": "sample"}[prediction],
+    )
+    scheduler.alphas_cumprod = alpha.flip(0) ** 2  # its discrete step k is our time n_steps - k
+    scheduler.set_timesteps(n_steps + 1)
+    steps = diffusion.solver_steps("ddim", schedule, n_steps)
+    start = th.randn(4, 3, dtype=th.float64, generator=th.Generator().manual_seed(0))
+    predict = gaussian_predictor(steps, prediction)
+    expected = start
+    for i in range(n_steps):
+        expected = scheduler.step(predict(expected, i), n_steps - i, expected, eta=0.0).prev_sample
+    actual = diffusion.solve(predict, start, steps, prediction)
+    th.testing.assert_close(actual, expected, atol=1e-6, rtol=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # in diffusers
+@pytest.mark.parametrize("n_steps", [1, 2, 3, 9])
+@pytest.mark.parametrize("time_grid", diffusion.TIME_GRIDS)
+@pytest.mark.parametrize("schedule", diffusion.SCHEDULES)
+def test_dpmsolver_takes_the_steps_of_diffusers(schedule, time_grid, n_steps):
+    diffusers = pytest.importorskip("diffusers")
+    alpha, sigma = oracle_levels(n_steps, schedule, time_grid)
+    scheduler = diffusers.DPMSolverMultistepScheduler(
+        num_train_timesteps=1000, algorithm_type="dpmsolver++", solver_order=2, prediction_type="v_prediction"
+    )
+    scheduler.set_timesteps(n_steps)
+    scheduler.sigmas = sigma / alpha
+    steps = diffusion.solver_steps("dpmsolver++2m", schedule, n_steps, time_grid)
+    start = th.randn(4, 3, dtype=th.float64, generator=th.Generator().manual_seed(0))
+    predict = gaussian_predictor(steps, "v")
+    expected = start
+    for i, timestep in enumerate(scheduler.timesteps):
+        expected = scheduler.step(predict(expected, i), timestep, expected).prev_sample
+    th.testing.assert_close(diffusion.solve(predict, start, steps, "v"), expected, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("solver", diffusion.SOLVERS)
+@pytest.mark.parametrize("schedule", diffusion.SCHEDULES)
+@pytest.mark.parametrize("prediction", diffusion.PREDICTIONS)
+def test_gaussian_samples_have_the_right_mean_and_deviation(solver, schedule, prediction):
+    noise = th.randn(20_000, 3, dtype=th.float64, generator=th.Generator().manual_seed(0))
+    samples = solve_gaussian(noise, 200, solver, schedule, prediction, "log_snr")
+    assert ((samples.mean(0) - MEAN).abs() < 0.03 * STD + 0.003).all()
+    th.testing.assert_close(samples.std(0), STD, rtol=0.04, atol=0.0)
+
+
+@pytest.mark.parametrize("schedule", diffusion.SCHEDULES)
+def test_order_of_convergence(schedule):
+    x = th.linspace(-2, 2, 5, dtype=th.float64)[:, None].expand(-1, 3)
+
+    def error(solver, n_steps):
+        sample = solve_gaussian(x, n_steps, solver, schedule, time_grid="log_snr")
+        return (sample - exact_gaussian(x, schedule)).abs().max().item()
+
+    ratios = {solver: error(solver, 100) / error(solver, 200) for solver in diffusion.SOLVERS}
+    assert ratios["ddim"] == pytest.approx(2, rel=0.1)
+    assert ratios["dpmsolver++2m"] == pytest.approx(4, rel=0.15)
+
+
+def test_impose_holds_before_every_step_and_at_the_end():
+    seen = []
+
+    def predict(x, i):
+        seen.append(x[0].item())
+        return x
+
+    steps = diffusion.solver_steps("dpmsolver++2m", "cosine", 4)
+    result = diffusion.solve(predict, th.randn(3), steps, "v", lambda x: th.cat([th.tensor([7.0]), x[1:]]))
+    assert seen == [7.0] * 4 and result[0] == 7.0
+
+
+def test_wrong_names_and_numbers_are_refused():
+    t = th.tensor([0.5])
+    for call in (
+        lambda: diffusion.alpha_sigma(t, "quadratic"),
+        lambda: diffusion.prediction_target(t, t, t, t, "score"),
+        lambda: diffusion.to_clean(t, t, 1.0, 0.0, "score"),
+        lambda: diffusion.to_noise(t, t, 1.0, 0.0, "score"),
+        lambda: diffusion.draw_times(1, "cosine", "beta"),
+        lambda: diffusion.draw_times(1, "quadratic", "uniform"),
+        lambda: diffusion.solver_steps("euler", "cosine", 5),
+        lambda: diffusion.solver_steps("ddim", "cosine", 5, "karras"),
+    ):
+        with pytest.raises(ValueError, match="expected one of"):
+            call()
+    with pytest.raises(ValueError, match="is 0, expected at least 1"):
+        diffusion.solver_steps("ddim", "cosine", 0)

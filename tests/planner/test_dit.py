@@ -1,0 +1,136 @@
+"""The transformer: embeddings, adaLN-zero, masks, and the parts of a call that are shared."""
+
+import pytest
+import torch as th
+
+from sb3_said.planner.dit import DiT1d, DiTBlock, sinusoidal_positions
+
+OBS, ACT, DELAY, LENGTH = 3, 2, 4, 10
+
+
+def make_network(randomised=True, **kwargs):
+    th.manual_seed(0)
+    network = DiT1d(OBS, ACT, DELAY, LENGTH, d_model=64, **kwargs)
+    if randomised:  # the initial zeros would hide everything
+        for parameter in network.parameters():
+            th.nn.init.normal_(parameter, std=0.1)
+    return network
+
+
+def make_inputs(n=6):
+    x = th.randn(n, LENGTH, OBS + ACT)
+    known = th.zeros(n, LENGTH, OBS + ACT, dtype=th.bool)
+    known[:, 0, :OBS] = True
+    known[:, :2, OBS:] = True
+    return x, known, th.linspace(0.1, 0.9, n)
+
+
+@pytest.mark.parametrize("length", [2, 12, 24])
+def test_sinusoidal_positions_are_distinct_and_all_features_alive(length):
+    positions = sinusoidal_positions(length, 256)
+    assert positions.shape == (length, 256) and positions.dtype == th.float32
+    distances = th.cdist(positions, positions) + 100 * th.eye(length)
+    assert distances.min() > 2.0
+    sine, cosine = positions.chunk(2, dim=1)
+    assert (sine.std(0) > 0.1).all() and (cosine.std(0) > 0.05).all()
+
+
+def test_sinusoidal_positions_against_a_naive_loop():
+    expected = th.tensor([[th.tensor(k * 5.0 ** -(j / 3)).sin().item() for j in range(4)] for k in range(5)])
+    th.testing.assert_close(sinusoidal_positions(5, 8)[:, :4], expected)
+
+
+@pytest.mark.parametrize("positions", ["sinusoidal", "learned"])
+@pytest.mark.parametrize("embed_known", [True, False])
+def test_untrained_output_is_zero_but_learns(positions, embed_known):
+    network = make_network(randomised=False, positions=positions, embed_known=embed_known)
+    x, known, t = make_inputs()
+    output = network(x, network.context(x, known), network.modulations(t))
+    assert output.shape == x.shape and (output == 0).all()
+    (output - 1).square().mean().backward()
+    assert network.out.weight.grad.abs().max() > 0
+
+
+def test_block_is_the_identity_while_its_gates_are_closed():
+    block, x = DiTBlock(64), 3 + 5 * th.randn(4, LENGTH, 64)
+    modulation = th.randn(4, 6, 64)
+    modulation[:, [2, 5]] = 0.0
+    assert th.equal(block(x, modulation), x)
+    # and adds to the very same stream when they open: the sum is linear in a gate
+    outputs = []
+    for gate in (1.0, 2.0):
+        modulation[:, 2] = gate
+        outputs.append(block(x, modulation) - x)
+    th.testing.assert_close(outputs[1], 2 * outputs[0], atol=1e-4, rtol=1e-4)
+
+
+def test_attention_matches_a_naive_one():
+    block, x = DiTBlock(64), th.randn(2, 5, 64)
+    q, k, v = block.qkv(x).split(64, dim=-1)
+    heads = [slice(0, 32), slice(32, 64)]
+    mixed = [(q[..., h] @ k[..., h].mT / 32**0.5).softmax(-1) @ v[..., h] for h in heads]
+    th.testing.assert_close(block._attention(x, None), block.attention_out(th.cat(mixed, -1)), atol=1e-5, rtol=1e-5)
+
+
+def test_outputs_of_valid_tokens_do_not_depend_on_padding():
+    network = make_network()
+    x, known, t = make_inputs()
+    valid = th.arange(LENGTH) < th.tensor([1, 3, 5, 7, 9, 10])[:, None]
+    context, modulations = network.context(x, known & valid[..., None]), network.modulations(t)
+    padded = th.where(valid[..., None], x, 100 * th.randn_like(x))
+    outputs = [network(inputs, context, modulations, valid)[valid] for inputs in (x, padded)]
+    th.testing.assert_close(outputs[0], outputs[1])
+    unmasked = [network(inputs, context, modulations)[valid] for inputs in (x, padded)]
+    assert (unmasked[0] - unmasked[1]).abs().max() > 0.01  # so the mask does something
+
+
+def test_context_reads_known_entries_only():
+    network = make_network()
+    x, known, _ = make_inputs()
+    base = network.context(x, known)
+    assert th.equal(network.context(th.where(known, x, 9.0), known), base)
+    for index in ((0, 0), (1, OBS)):  # the known state, the last known action
+        changed = x.clone()
+        changed[:, index[0], index[1]] += 1.0
+        difference = (network.context(changed, known) - base).abs().amax((0, 2))
+        assert (difference > 1e-3).all()  # every token is told
+    assert (network.context(x, known) - network.context(x, th.zeros_like(known))).abs().amax(2).min() > 1e-3
+
+
+def test_sharing_modulations_and_contexts_changes_nothing():
+    network = make_network(depth=3)
+    x, known, _ = make_inputs()
+    known = known.clone()
+    known[3:, 2, OBS:] = True
+    alone = th.cat(
+        [
+            network(
+                x[i : i + 1], network.context(x[j : j + 1], known[j : j + 1]), network.modulations(th.tensor([0.3]))
+            )
+            for i, j in enumerate([0, 0, 0, 3, 3, 3])
+        ]
+    )
+    context = network.context(x[[0, 3]], known[[0, 3]])  # each for three windows in a row
+    shared = network(x, context, network.modulations(th.tensor([0.3])))
+    each = network(x, context, network.modulations(th.full((6,), 0.3)))
+    th.testing.assert_close(shared, alone, atol=1e-5, rtol=1e-5)
+    th.testing.assert_close(each, alone, atol=1e-5, rtol=1e-5)
+
+
+def test_order_and_time_matter():
+    network = make_network()
+    x, known, t = make_inputs()
+    context = network.context(x, known)
+    output = network(x, context, network.modulations(t))
+    assert (network(x, context, network.modulations(t + 0.05)) - output).abs().max() > 0.01
+    # A set of tokens without places would be equivariant; no flag may tell the places apart here
+    context = network.context(x, th.zeros_like(known))
+    output, flipped = (network(inputs, context, network.modulations(t)) for inputs in (x, x.flip(1)))
+    assert (flipped.flip(1) - output).abs().max() > 0.01
+
+
+def test_bad_arguments_are_refused():
+    with pytest.raises(ValueError, match=r"d_model is 48, .* multiple of 32"):
+        DiT1d(OBS, ACT, DELAY, LENGTH, d_model=48)
+    with pytest.raises(ValueError, match="positions is 'rotary', expected one of"):
+        DiT1d(OBS, ACT, DELAY, LENGTH, positions="rotary")

@@ -1,0 +1,78 @@
+"""The planner against a system whose hidden present and best plan are known in closed form."""
+
+from __future__ import annotations
+
+import pytest
+import torch as th
+from linear_system import (
+    ACTION_DIM,
+    BEHAVIOUR_GAIN,
+    BEHAVIOUR_NOISE,
+    STATE_DIM,
+    delayed_cost,
+    make_source,
+    present,
+    riccati,
+)
+
+from sb3_said.planner import InpaintingPlanner, PlannerConfig
+from sb3_said.planner.trainer import PlannerTrainer
+
+pytestmark = pytest.mark.slow
+D = 3
+GRADIENT_STEPS = 800
+
+
+@pytest.fixture(scope="module")
+def trainer() -> PlannerTrainer:
+    with th.random.fork_rng(devices=[]):
+        th.manual_seed(0)
+        config = PlannerConfig(
+            depth=2,
+            d_model=64,
+            horizon=5,
+            batch_size=64,
+            learning_rate=2e-3,
+            warmup_steps=100,
+            ema_decay=0.99,
+            weight_factor=0.0,
+            sampling_steps=5,
+            mask="random",
+            precision="float32",
+        )
+        planner = InpaintingPlanner(STATE_DIM, ACTION_DIM, D, config)
+    trainer = PlannerTrainer(planner, make_source(), GRADIENT_STEPS)
+    trainer.train()
+    return trainer
+
+
+def test_every_delay_s_present_is_decoded(trainer):
+    errors = trainer.evaluate()
+    for d in range(D + 1):
+        # Errors are in standard deviations of the states
+        assert errors[f"planner/present_error_d{d}"] < 0.05
+        assert errors[f"planner/present_error_d{d}"] < errors[f"planner/present_error_mlp_d{d}"] + 0.01
+        assert errors[f"planner/action_error_d{d}"] < 1.05 * errors[f"planner/action_error_mlp_d{d}"]
+
+
+def test_selection_by_value_approaches_the_best_plan(trainer):
+    K, P = riccati()
+    generator = th.Generator().manual_seed(2)
+
+    def behaviour(observation, history, delay):
+        noise = BEHAVIOUR_NOISE * th.randn(len(observation), ACTION_DIM, generator=generator)
+        return noise - present(observation, history, delay) @ BEHAVIOUR_GAIN.T
+
+    def lqr(observation, history, delay):
+        return -present(observation, history, delay) @ K.T
+
+    def planned(observation, history, delay):
+        value = lambda states, actions: -(states @ P * states).sum(-1)  # noqa: E731
+        plan = trainer.planner.plan(
+            observation, history, delay, value_fn=value, n_candidates=16, temperature=1.0, generator=generator
+        )
+        return plan.action
+
+    costs = {f.__name__: delayed_cost(f, D, n_episodes=32) for f in (behaviour, lqr, planned)}
+    # Most of what there is to gain over the data
+    assert costs["planned"] < costs["lqr"] + 0.4 * (costs["behaviour"] - costs["lqr"]), costs

@@ -1,0 +1,487 @@
+"""The planner: configuration, normaliser, loss, plans, selection, refusals."""
+
+import dataclasses
+import json
+
+import pytest
+import torch as th
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sb3_said.common.windows import Windows
+from sb3_said.planner import InpaintingPlanner, PlannerConfig, precision
+from sb3_said.planner.diffusion import alpha_sigma, draw_times
+from sb3_said.planner.normalizer import Normalizer
+
+OBS, ACT, DELAY = 3, 2, 4
+SMALL = PlannerConfig(depth=2, d_model=32, horizon=4, precision="float32", sampling_steps=3, n_candidates=5)
+LENGTH = DELAY + SMALL.horizon
+
+
+def make_planner(max_delay=DELAY, **changes):
+    """A planner whose weights and statistics are random, so that every input shows in the output."""
+    planner = InpaintingPlanner(OBS, ACT, max_delay, dataclasses.replace(SMALL, **changes))
+    generator = th.Generator().manual_seed(1)
+    for parameter in planner.parameters():
+        th.nn.init.normal_(parameter, std=0.2, generator=generator)
+    states = th.tensor([10.0, 0.0, -3.0]) + th.tensor([4.0, 0.1, 1.0]) * th.randn(100, OBS, generator=generator)
+    planner.fit_normalizer(states, th.rand(100, ACT, generator=generator) * 2 - 1)
+    return planner
+
+
+def make_batch(n, max_delay=DELAY, seed=0):
+    generator = th.Generator().manual_seed(seed)
+    observation = 5 * th.randn(n, OBS, generator=generator)
+    history = th.rand(n, max_delay, ACT, generator=generator) * 2 - 1
+    return observation, history, th.randint(max_delay + 1, (n,), generator=generator)
+
+
+def make_windows(n=6, seed=0):
+    generator = th.Generator().manual_seed(seed)
+    valid = th.arange(LENGTH) < th.randint(1, LENGTH + 1, (n, 1), generator=generator)
+    states = 5 * th.randn(n, LENGTH, OBS, generator=generator)
+    actions = th.rand(n, LENGTH, ACT, generator=generator) * 2 - 1
+    return Windows(states, actions, valid, th.rand(n, generator=generator))
+
+
+def seeded(seed=0):
+    return th.Generator().manual_seed(seed)
+
+
+class FakeNetwork(th.nn.Module):
+    """Answers with a stored tensor and remembers what it was shown."""
+
+    def __init__(self, output):
+        super().__init__()
+        self.output = output
+
+    def context(self, window, known):
+        self.known = known
+
+    def modulations(self, t):
+        self.t = t
+
+    def forward(self, x, context, modulations, valid):
+        self.x, self.valid = x, valid
+        return self.output
+
+
+# --- configuration ---------------------------------------------------------------------------------------------------
+
+
+def test_paper_config_is_the_papers_table():
+    config = PlannerConfig.paper(depth=4, temperature=0.3)
+    expected = {"depth": 4, "d_model": 256, "horizon": 8, "prediction": "epsilon", "schedule": "linear"}
+    expected |= {"solver": "ddim", "sampling_steps": 20, "n_candidates": 50, "temperature": 0.3, "mask": "fixed"}
+    expected |= {"action_transform": "tanh", "scored_states": "all", "batch_size": 256, "learning_rate": 2e-4}
+    expected |= {"ema_decay": 0.9999, "weight_factor": 2.0, "warmup_steps": 0, "gradient_clip": None}
+    assert expected.items() <= dataclasses.asdict(config).items()
+    assert PlannerConfig.paper(sampling_steps=2).sampling_steps == 2
+
+
+def test_config_survives_json():
+    config = PlannerConfig(betas=(0.8, 0.99))
+    assert PlannerConfig(**json.loads(json.dumps(dataclasses.asdict(config)))) == config
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"prediction": "score"}, r"prediction is 'score', expected one of \('v', 'epsilon', 'x0'\)"),
+        ({"positions": "rotary"}, "positions is 'rotary'"),
+        ({"schedule": "sqrt"}, "schedule is 'sqrt'"),
+        ({"time_sampling": "beta"}, "time_sampling is 'beta'"),
+        ({"mask": "block"}, "mask is 'block'"),
+        ({"action_transform": "log"}, "action_transform is 'log'"),
+        ({"solver": "euler"}, "solver is 'euler'"),
+        ({"time_grid": "karras"}, "time_grid is 'karras'"),
+        ({"scored_states": "past"}, "scored_states is 'past'"),
+        ({"precision": "half"}, "precision is 'half'"),
+        ({"lr_schedule": "step"}, "lr_schedule is 'step'"),
+        ({"horizon": 1}, "horizon is 1, expected at least 2"),
+        ({"depth": 0}, "depth is 0, expected at least 1"),
+        ({"temperature": float("nan")}, "temperature is nan, expected at least 0"),
+        ({"d_model": 100}, "d_model is 100, expected a multiple of 32"),
+        ({"learning_rate": 0.0}, "learning_rate is 0.0"),
+        ({"gradient_clip": 0.0}, "give gradient_clip=None"),
+        ({"ema_decay": 1.5}, r"ema_decay is 1.5, expected a number in \[0, 1\]"),
+    ],
+)
+def test_config_refuses(changes, message):
+    with pytest.raises(ValueError, match=message):
+        PlannerConfig(**changes)
+
+
+# --- normaliser ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("transform", ["standard", "tanh"])
+def test_normalised_data_has_mean_0_and_deviation_1(transform):
+    normalizer = Normalizer(3, 1, transform)
+    states = th.randn(1000, 3, generator=seeded()) * th.tensor([3.0, 1e-7, 0.0]) + th.tensor([50.0, 0.0, 1.2345])
+    actions = (2 * th.randn(1000, 1, generator=seeded(1))).tanh()
+    normalizer.fit(states, actions)
+    normal = normalizer.normalize_states(states)
+    th.testing.assert_close(normal.mean(0), th.zeros(3), atol=1e-4, rtol=0.0)
+    th.testing.assert_close(normal.std(0, correction=0), th.tensor([1.0, 1.0, 0.0]), atol=1e-4, rtol=0.0)
+    normal = normalizer.normalize_actions(actions)
+    assert normal.mean().item() == pytest.approx(0, abs=1e-4)
+    assert normal.std(correction=0).item() == pytest.approx(1, abs=1e-4)
+    th.testing.assert_close(normalizer.denormalize_states(normalizer.normalize_states(states)), states)
+
+
+@pytest.mark.parametrize("transform", ["standard", "tanh"])
+@given(action=st.floats(-1, 1), prediction=st.floats(-1e3, 1e3), mean=st.floats(-1, 1), std=st.floats(0.1, 3))
+def test_actions_return_from_the_transform_within_bounds(transform, action, prediction, mean, std):
+    normalizer = Normalizer(1, 1, transform)
+    normalizer.action_mean.fill_(mean)
+    normalizer.action_std.fill_(std)
+    action = th.tensor([action])
+    back = normalizer.denormalize_actions(normalizer.normalize_actions(action))
+    expected = action if transform == "standard" else action.clamp(-0.999, 0.999)
+    th.testing.assert_close(back, expected, atol=1e-5, rtol=1e-5)
+    assert -1 <= normalizer.denormalize_actions(th.tensor([prediction])).item() <= 1
+
+
+# --- loss ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("prediction", ["v", "epsilon", "x0"])
+@pytest.mark.parametrize("schedule", ["cosine", "linear"])
+def test_loss_against_a_naive_computation(prediction, schedule):
+    planner, windows = make_planner(prediction=prediction, schedule=schedule), make_windows()
+    n = len(windows.states)
+    delay, weight = th.tensor([0, 1, 2, 3, 4, 4]), th.rand(n)
+    planner.network = network = FakeNetwork(th.randn(n, LENGTH, OBS + ACT))
+    loss = planner.loss(windows, delay, weight, seeded())
+
+    generator = seeded()
+    noise = th.randn(n, LENGTH, OBS + ACT, generator=generator)
+    t = draw_times(n, schedule, planner.config.time_sampling, generator)
+    normalizer, total, count = planner.normalizer, 0.0, 0
+    for b in range(n):
+        alpha, sigma = alpha_sigma(t[b], schedule)
+        for k in range(LENGTH):
+            state = (windows.states[b, k] - normalizer.state_mean) / normalizer.state_std
+            action = (windows.actions[b, k] - normalizer.action_mean) / normalizer.action_std
+            clean = th.cat([state, action])
+            for j in range(OBS + ACT):
+                if not windows.valid[b, k]:
+                    assert not network.known[b, k, j]
+                    continue
+                known = k == 0 if j < OBS else k < delay[b]
+                assert network.known[b, k, j] == known
+                noisy = alpha * clean[j] + sigma * noise[b, k, j]
+                th.testing.assert_close(network.x[b, k, j], clean[j] if known else noisy)
+                if not known:
+                    v = alpha * noise[b, k, j] - sigma * clean[j]
+                    target = {"v": v, "epsilon": noise[b, k, j], "x0": clean[j]}[prediction]
+                    total += weight[b] * (network.output[b, k, j] - target) ** 2
+                    count += 1
+    th.testing.assert_close(loss, total / count, atol=1e-5, rtol=1e-5)
+    assert th.equal(network.valid, windows.valid) and th.equal(network.t, t)
+
+
+def test_loss_has_no_gradient_at_known_and_padded_entries():
+    planner, windows = make_planner(), make_windows()
+    planner.network = network = FakeNetwork(th.randn(6, LENGTH, OBS + ACT, requires_grad=True))
+    planner.loss(windows, th.tensor([0, 1, 2, 3, 4, 4]), generator=seeded()).backward()
+    learned = windows.valid[..., None] & ~network.known
+    assert th.equal(network.output.grad != 0, learned) and not learned.all()
+
+
+def test_loss_does_not_depend_on_what_pads():
+    planner, windows = make_planner(), make_windows()
+    behind = ~windows.valid[..., None]
+    other = windows._replace(
+        states=th.where(behind, 1e3, windows.states), actions=th.where(behind, -1.0, windows.actions)
+    )
+    delay = th.full((6,), DELAY)
+    losses = [planner.loss(batch, delay, generator=seeded()).item() for batch in (windows, other)]
+    assert losses[0] == pytest.approx(losses[1], rel=1e-5) and behind.any()
+
+
+def test_weight_scales_the_loss_and_each_window():
+    planner, windows = make_planner(), make_windows()
+    delay = th.full((6,), 2)
+    plain = planner.loss(windows, delay, generator=seeded())
+    th.testing.assert_close(planner.loss(windows, delay, th.full((6,), 0.25), seeded()), 0.25 * plain)
+    parts = [planner.loss(windows, delay, weight, seeded()) for weight in th.eye(6)]
+    th.testing.assert_close(sum(parts), plain)
+
+
+def test_loss_draws_mask_lengths_from_its_generator():
+    planner, windows = make_planner(), make_windows()
+    assert planner.loss(windows, generator=seeded(3)) == planner.loss(windows, generator=seeded(3))
+    planner.network = network = FakeNetwork(th.zeros(6, LENGTH, OBS + ACT))
+    full = windows._replace(valid=th.ones(6, LENGTH, dtype=th.bool))
+    lengths = set()
+    for seed in range(20):
+        planner.loss(full, generator=seeded(seed))
+        lengths |= set(network.known[:, :, -1].sum(1).tolist())
+    assert lengths == set(range(DELAY + 1))
+
+
+def test_window_that_is_all_known_gives_zero_not_nan():
+    windows = make_windows(1)._replace(valid=th.arange(LENGTH)[None] < 1)
+    assert make_planner().loss(windows, th.tensor([DELAY])) == 0.0
+
+
+def test_bfloat16_keeps_loss_gradients_and_state_in_float32():
+    planner, reference = make_planner(precision="bfloat16"), make_planner()
+    windows, delay = make_windows(), th.tensor([0, 1, 2, 3, 4, 4])
+    loss = planner.loss(windows, delay, generator=seeded())
+    assert loss.dtype == th.float32
+    assert loss.item() == pytest.approx(reference.loss(windows, delay, generator=seeded()).item(), rel=0.02)
+    loss.backward()
+    assert all(p.grad.dtype == th.float32 and p.grad.isfinite().all() for p in planner.parameters())
+    batch = make_batch(8)
+    plan, exact = (p.plan(*batch, n_candidates=4, generator=seeded()) for p in (planner, reference))
+    assert plan.states.dtype == th.float32 and not th.equal(plan.states, exact.states)
+    scale = planner.normalizer.state_std
+    assert ((plan.states - exact.states) / scale).abs().mean() < 0.05 * (exact.states / scale).std()
+
+
+def test_autocast_follows_the_precision():
+    cpu = th.device("cpu")
+    seen = {}
+    for name in ("float32", "bfloat16", "auto"):
+        with precision.autocast(name, cpu):
+            seen[name] = th.nn.Linear(2, 2)(th.zeros(1, 2)).dtype
+    auto = th.bfloat16 if precision.has_bfloat16(cpu) else th.float32
+    assert seen == {"float32": th.float32, "bfloat16": th.bfloat16, "auto": auto}
+    assert not precision.has_bfloat16(th.device("mps"))
+    with pytest.raises(ValueError, match="precision is 'half'"):
+        precision.autocast("half", cpu)
+
+
+# --- plan ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("transform", ["standard", "tanh"])
+@pytest.mark.parametrize("solver", ["ddim", "dpmsolver++2m"])
+@pytest.mark.parametrize("max_delay", [0, DELAY])
+def test_known_entries_come_back_exactly_at_mixed_delays(max_delay, solver, transform):
+    planner = make_planner(max_delay, solver=solver, action_transform=transform)
+    delay = th.arange(max_delay + 1).repeat(2)
+    observation, history, _ = make_batch(len(delay), max_delay)
+    plan = planner.plan(observation, history, delay, n_candidates=3)
+    length = max_delay + SMALL.horizon
+    assert plan.states.shape == (len(delay), 3, length, OBS) and plan.actions.shape[-2:] == (length, ACT)
+    assert plan.action.shape == (len(delay), ACT) and (plan.values == 0).all()
+    for b, d in enumerate(delay):
+        for n in range(3):
+            assert th.equal(plan.states[b, n, 0], observation[b])
+            assert th.equal(plan.actions[b, n, :d], history[b, max_delay - d :])
+        assert th.equal(plan.action[b], plan.actions[b, 0, d])
+    assert plan.actions.abs().max() <= 1 and plan.states.isfinite().all()
+    assert not th.equal(plan.states[:, 0, 1:], plan.states[:, 1, 1:])  # candidates differ where nothing is known
+
+
+def test_unknown_part_depends_on_all_that_is_known_and_on_nothing_else():
+    planner = make_planner(temperature=0.0)
+    observation, history, _ = make_batch(1)
+
+    def present(observation, history, d):
+        return planner.plan(observation, history, th.tensor([d])).states[0, 0, d]
+
+    for d in range(1, DELAY + 1):
+        base = present(observation, history, d)
+        for k in range(DELAY):
+            changed = history.clone()
+            changed[0, k] *= -1
+            assert th.equal(present(observation, changed, d), base) == (k < DELAY - d)  # too old to matter, or known
+        assert not th.equal(present(observation + 1, history, d), base)
+
+
+def test_every_network_call_sees_the_known_entries_clean():
+    planner = make_planner()
+    observation, history, delay = make_batch(5)
+    clean = planner.plan(observation, history, delay, temperature=0.0, sampling_steps=1)
+    normal = th.cat(
+        [planner.normalizer.normalize_states(clean.states), planner.normalizer.normalize_actions(clean.actions)], -1
+    )
+    known = th.zeros(5, 1, LENGTH, OBS + ACT, dtype=th.bool)
+    known[:, :, 0, :OBS] = True
+    for b, d in enumerate(delay):
+        known[b, :, :d, OBS:] = True
+    seen = []
+    planner.network.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    planner.plan(observation, history, delay, n_candidates=3, sampling_steps=4)
+    assert len(seen) == 4
+    for x in seen:
+        x = x.unflatten(0, (5, 3))
+        th.testing.assert_close(x[known.expand_as(x)], normal.expand_as(x)[known.expand_as(x)])
+
+
+@pytest.mark.parametrize("scored_states", ["future", "all"])
+def test_selection_scores_the_right_states_and_takes_the_best(scored_states):
+    planner = make_planner(scored_states=scored_states)
+    observation, history, delay = make_batch(20)
+
+    def value_fn(states, actions):
+        return states.sin().sum(-1) + actions.prod(-1)
+
+    plan = planner.plan(observation, history, delay, value_fn, n_candidates=7, generator=seeded())
+    best = []
+    for b, d in enumerate(delay.tolist()):
+        first = d + 1 if scored_states == "future" else 1
+        scores = []
+        for n in range(7):
+            marks = [value_fn(plan.states[b, n, k], plan.actions[b, n, k]) for k in range(first, LENGTH)]
+            scores.append(sum(marks) / len(marks))
+        th.testing.assert_close(plan.values[b], th.stack(scores), atol=1e-5, rtol=1e-4)
+        best.append(int(th.stack(scores).argmax()))
+        assert th.equal(plan.action[b], plan.actions[b, best[-1], d])
+    assert len(set(best)) > 2  # otherwise the first could have been taken every time
+
+
+def test_value_function_must_give_one_number_per_state():
+    planner, batch = make_planner(), make_batch(2)
+    with pytest.raises(ValueError, match="drop a last dimension of 1"):
+        planner.plan(*batch, value_fn=lambda states, actions: states[..., :1])
+    with pytest.raises(ValueError, match="value_fn returned NaN"):
+        planner.plan(*batch, value_fn=lambda states, actions: states[..., 0] * th.nan)
+
+
+def test_number_of_candidates_and_steps_can_be_set_per_call():
+    planner, batch, calls = make_planner(), make_batch(2), []
+    planner.network.register_forward_hook(lambda *_: calls.append(1))
+
+    def value_fn(states, actions):
+        return states[..., 0]
+
+    assert planner.plan(*batch, value_fn).values.shape == (2, 5) and len(calls) == 3
+    assert planner.plan(*batch, value_fn, n_candidates=2, sampling_steps=6).values.shape == (2, 2) and len(calls) == 9
+    assert planner.plan(*batch).values.shape == (2, 1)  # nothing to choose by
+
+
+def test_temperature_zero_draws_one_candidate_and_no_noise():
+    planner, batch = make_planner(), make_batch(3)
+    plans = [planner.plan(*batch, n_candidates=9, temperature=0.0, generator=seeded(seed)) for seed in (0, 1)]
+    assert plans[0].states.shape[1] == 1
+    assert all(th.equal(a, b) for a, b in zip(*plans, strict=True))
+    assert th.equal(planner.plan(*batch, temperature=0.0, noise=th.randn(4, LENGTH, OBS + ACT)).action, plans[0].action)
+
+
+def test_noise_and_generator_repeat_a_plan():
+    planner, batch = make_planner(), make_batch(3)
+    noise = th.randn(4, LENGTH, OBS + ACT)
+    for kwargs in ({"noise": noise}, {"n_candidates": 4, "generator": None}):
+        plans = []
+        for _ in range(2):
+            if "generator" in kwargs:
+                kwargs["generator"] = seeded()
+            plans.append(planner.plan(*batch, **kwargs))
+        assert plans[0].states.shape[1] == 4 and th.equal(plans[0].states, plans[1].states)
+    other = planner.plan(*batch, n_candidates=4, generator=seeded(1))
+    assert not th.equal(other.states, plans[0].states)
+    # Temperature is a factor on the initial noise and on nothing else
+    twice, half = (planner.plan(*batch, noise=noise * f, temperature=0.5 / f).states for f in (2.0, 0.5))
+    th.testing.assert_close(twice, half, atol=1e-4, rtol=1e-4)
+
+
+def test_decisions_and_candidates_do_not_disturb_each_other():
+    planner, noise = make_planner(), th.randn(3, LENGTH, OBS + ACT)
+    observation, history, delay = make_batch(6)
+    together = planner.plan(observation, history, delay, noise=noise)
+    order = th.tensor([3, 0, 5, 1, 4, 2])
+    permuted = planner.plan(observation[order], history[order], delay[order], noise=noise[[2, 0, 1]])
+    th.testing.assert_close(permuted.states, together.states[order][:, [2, 0, 1]], atol=1e-4, rtol=1e-4)
+    for b in range(6):
+        alone = planner.plan(observation[b : b + 1], history[b : b + 1], delay[b : b + 1], noise=noise)
+        th.testing.assert_close(alone.states[0], together.states[b], atol=1e-4, rtol=1e-4)
+
+
+def test_state_dict_carries_weights_and_statistics():
+    planner, batch = make_planner(), make_batch(3)
+    other = InpaintingPlanner(OBS, ACT, DELAY, planner.config)
+    other.load_state_dict(planner.state_dict())
+    plans = [p.plan(*batch, n_candidates=2, generator=seeded()).states for p in (planner, other)]
+    assert th.equal(*plans)
+
+
+def test_plan_leaves_no_graph_and_works_with_frozen_weights():
+    planner = make_planner().requires_grad_(False)
+    assert not planner.plan(*make_batch(2)).states.requires_grad
+    assert not make_planner().plan(*make_batch(2)).states.requires_grad
+
+
+def test_training_learns_to_decode_the_present():
+    """s' = s + a: after a short training the hidden present is the old state plus the known actions."""
+    th.manual_seed(0)
+    generator = seeded()
+    config = dataclasses.replace(SMALL, d_model=64, horizon=2, sampling_steps=4)
+    planner = InpaintingPlanner(1, 1, 2, config)
+
+    def draw(n):
+        actions = th.rand(n, 4, 1, generator=generator) * 2 - 1
+        states = th.randn(n, 1, 1, generator=generator) + actions.cumsum(1) - actions
+        return Windows(states, actions, th.ones(n, 4, dtype=th.bool), th.ones(n))
+
+    data = draw(2000)
+    planner.fit_normalizer(data.states.flatten(0, 1), data.actions.flatten(0, 1))
+    optimizer = th.optim.Adam(planner.parameters(), lr=2e-3)
+    for _ in range(300):
+        optimizer.zero_grad()
+        planner.loss(draw(128), generator=generator).backward()
+        optimizer.step()
+    test = draw(300)
+    for d in (0, 1, 2):
+        history = th.cat([th.zeros(300, 2 - d, 1), test.actions[:, :d]], 1)
+        plan = planner.plan(test.states[:, 0], history, th.full((300,), d), temperature=0.0)
+        error = (plan.states[:, 0, d] - test.states[:, d]).abs().mean().item()
+        assert error <= 0.15 * test.states.std().item()
+
+
+# --- refusals --------------------------------------------------------------------------------------------------------
+
+
+def good():
+    observation, history, delay = make_batch(2)
+    return {"observation": observation, "action_history": history, "delay": delay}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"observation": th.zeros(2, 4)}, r"observation has the shape \(2, 4\), expected \(any, 3\)"),
+        ({"observation": th.tensor(1.0)}, r"observation has the shape \(\), expected \(any, 3\)"),
+        ({"observation": th.zeros(0, 3)}, "observation is empty"),
+        ({"observation": th.full((2, 3), th.nan)}, "observation has entries that are NaN or infinite"),
+        ({"action_history": th.zeros(2, 3, 2)}, r"action_history has the shape \(2, 3, 2\), expected \(2, 4, 2\)"),
+        ({"action_history": th.full((2, 4, 2), th.inf)}, "action_history has entries that are NaN or infinite"),
+        ({"delay": th.tensor([0, 5])}, r"delay runs from 0 to 5, expected 0\.\.4"),
+        ({"delay": th.tensor([-1, 0])}, r"delay runs from -1 to 0, expected 0\.\.4"),
+        ({"delay": th.tensor([1.0, 2.0])}, "delay is torch.float32 .* expected integers"),
+        ({"delay": th.tensor([1])}, r"delay is torch.int64 of the shape \(1,\), expected integers of the shape \(2,\)"),
+        ({"n_candidates": 0}, "n_candidates is 0"),
+        ({"temperature": -0.5}, "temperature -0.5"),
+        ({"sampling_steps": 0}, "is 0, expected at least 1"),
+        ({"noise": th.zeros(3, 1, 5)}, r"noise has the shape \(3, 1, 5\), expected \(any, 8, 5\)"),
+        ({"noise": th.zeros(3, 8, 5), "n_candidates": 4}, r"noise has the shape \(3, 8, 5\), expected \(4, 8, 5\)"),
+    ],
+)
+def test_plan_refuses_before_it_computes(changes, message):
+    planner = make_planner()
+    planner.network = None  # nothing may be computed
+    with pytest.raises(ValueError, match=message):
+        planner.plan(**(good() | changes))
+
+
+def test_loss_and_normaliser_refuse():
+    planner, windows = make_planner(), make_windows()
+    with pytest.raises(ValueError, match=r"windows.states has the shape \(6, 5, 3\), expected \(any, 8, 3\)"):
+        planner.loss(windows._replace(states=windows.states[:, :5]))
+    with pytest.raises(ValueError, match=r"windows.actions has the shape"):
+        planner.loss(windows._replace(actions=windows.actions[..., :1]))
+    with pytest.raises(ValueError, match=r"weight has the shape \(6, 1\), expected \(6\)"):
+        planner.loss(windows, weight=th.ones(6, 1))
+    with pytest.raises(ValueError, match=r"delay runs from 9 to 9"):
+        planner.loss(windows, th.full((6,), 9))
+    with pytest.raises(ValueError, match="states has entries that are NaN"):
+        planner.fit_normalizer(th.full((4, OBS), th.nan), th.zeros(4, ACT))
+    with pytest.raises(ValueError, match="actions has the shape"):
+        planner.fit_normalizer(th.zeros(4, OBS), th.zeros(5, ACT))
+    with pytest.raises(ValueError, match="obs_dim, act_dim and max_delay are 3, 0 and -1"):
+        InpaintingPlanner(3, 0, -1)

@@ -1,0 +1,267 @@
+"""Training: formulas, determinism, resuming, held-out data."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+
+import numpy as np
+import pytest
+import torch as th
+from linear_system import ACTION_DIM, STATE_DIM, make_source
+
+from sb3_said.planner import InpaintingPlanner, PlannerConfig
+from sb3_said.planner.trainer import PlannerTrainer, ema_decay, learning_rate, value_weight
+
+D = 3
+
+
+def make_trainer(gradient_steps=12, held_out=0.1, seed=0, source=None, max_delay=D, **config) -> PlannerTrainer:
+    defaults = dict(depth=1, d_model=32, horizon=3, batch_size=16, warmup_steps=4, learning_rate=1e-3, sampling_steps=2)
+    with th.random.fork_rng(devices=[]):
+        th.manual_seed(seed)
+        planner = InpaintingPlanner(STATE_DIM, ACTION_DIM, max_delay, PlannerConfig(**{**defaults, **config}))
+    return PlannerTrainer(planner, source or make_source(40, 20), gradient_steps, held_out, seed)
+
+
+def leaves(tree, path=""):
+    """Walk a state dict, refusing what could not be written without pickle."""
+    if isinstance(tree, dict):
+        for key, value in tree.items():
+            assert isinstance(key, str), path
+            yield from leaves(value, f"{path}/{key}")
+    elif isinstance(tree, list):
+        for i, value in enumerate(tree):
+            yield from leaves(value, f"{path}/{i}")
+    else:
+        assert isinstance(tree, (int, float, str, th.Tensor)) or tree is None, f"{path}: {type(tree)}"
+        yield path, tree
+
+
+def assert_same(first, second):
+    for (path, a), (other_path, b) in zip(leaves(first), leaves(second), strict=True):
+        assert path == other_path
+        assert th.equal(a, b) if isinstance(a, th.Tensor) else a == b, path
+
+
+def test_value_weight():
+    values = th.tensor([0.0, 0.25, 1.0])
+    expected = [math.exp(-2.0), math.exp(-1.5), 1.0]
+    np.testing.assert_allclose(value_weight(values, 2.0), expected, rtol=1e-6)
+    np.testing.assert_array_equal(value_weight(values, 0.0), np.ones(3))
+
+
+def test_loss_receives_the_weights(monkeypatch):
+    trainer = make_trainer(weight_factor=3.0)
+    seen = {}
+
+    def loss(windows, delay=None, weight=None, generator=None):
+        seen.update(values=windows.values, weight=weight, delay=delay)
+        return sum(parameter.sum() for parameter in trainer.online.parameters())
+
+    monkeypatch.setattr(trainer.online, "loss", loss)
+    trainer.step()
+    np.testing.assert_allclose(seen["weight"], np.exp(3.0 * (seen["values"].numpy() - 1.0)), rtol=1e-6)
+    assert seen["values"].unique().numel() > 1
+    assert set(seen["delay"].tolist()) <= set(range(D + 1))
+
+
+def test_learning_rate_is_linear_then_cosine():
+    config = PlannerConfig(learning_rate=2.0, warmup_steps=10)
+    rates = [learning_rate(step, 110, config) for step in range(111)]
+    np.testing.assert_allclose(rates[:10], np.arange(1, 11) / 5)
+    np.testing.assert_allclose(rates[10:], 1 + np.cos(np.pi * np.arange(101) / 100), atol=1e-12)
+    assert learning_rate(0, 1, PlannerConfig(learning_rate=2.0, warmup_steps=0)) == 2.0
+
+
+def test_optimizers_follow_the_schedule():
+    trainer = make_trainer(gradient_steps=8, warmup_steps=4, learning_rate=2e-3)
+    rates = []
+    trainer.train(callback=lambda t: rates.append(t.pop_losses()["planner/learning_rate"]))
+    expected = [0.5e-3, 1e-3, 1.5e-3, 2e-3] + [1e-3 * (1 + math.cos(math.pi * k / 4)) for k in range(4)]
+    np.testing.assert_allclose(rates, expected)
+
+
+def test_planner_holds_the_average_of_the_online_weights():
+    trainer = make_trainer(ema_decay=0.3)
+    naive = [parameter.detach().clone() for parameter in trainer.planner.parameters()]
+    for step in range(6):
+        trainer.step()
+        decay = min(0.3, (1 + step) / (10 + step))
+        assert ema_decay(step, trainer.config) == decay
+        for mean, parameter in zip(naive, trainer.online.parameters(), strict=True):
+            mean.mul_(decay).add_(parameter.detach(), alpha=1 - decay)
+    for mean, averaged in zip(naive, trainer.planner.parameters(), strict=True):
+        th.testing.assert_close(averaged, mean)
+    online = th.cat([parameter.detach().flatten() for parameter in trainer.online.parameters()])
+    assert (th.cat([mean.flatten() for mean in naive]) - online).abs().max() > 1e-5
+
+
+@pytest.mark.parametrize("precision", ["float32", "auto"])
+def test_resumed_training_ends_bit_for_bit_the_same(precision):
+    whole = make_trainer(precision=precision)
+    whole.train()
+
+    first = make_trainer(precision=precision)
+    first.train(5)
+    saved = first.state_dict()
+    untouched = copy.deepcopy(saved)
+    first.train(2)  # must not reach into what was saved
+    assert_same(saved, untouched)
+
+    second = make_trainer(precision=precision)
+    second.train(3)  # whatever it did before is forgotten
+    second.load_state_dict(saved)
+    assert second.n_updates == 5
+    assert second.train()
+    assert_same(second.state_dict(), whole.state_dict())
+    assert second.evaluate() == whole.evaluate()
+    assert second.pop_losses() == whole.pop_losses()
+    assert_same(saved, untouched)
+
+
+def test_settings_survive_json_and_others_are_refused():
+    trainer = make_trainer()
+    state = trainer.state_dict()
+    state["settings"] = json.loads(json.dumps(state["settings"]))
+    make_trainer().load_state_dict(state)
+    for other in (
+        make_trainer(gradient_steps=13),
+        make_trainer(learning_rate=3e-3),
+        make_trainer(seed=1),
+        make_trainer(held_out=0.2),
+        make_trainer(source=make_source(41, 20)),
+    ):
+        with pytest.raises(ValueError, match=r"was .* and is now"):
+            other.load_state_dict(state)
+
+
+def test_held_out_episodes_are_never_trained_on():
+    source = make_source(20, 15)
+    # Every state tells its episode
+    source.states[..., 0] = th.arange(20.0).expand(15, 20)
+    trainer = make_trainer(source=source, held_out=0.25)
+    held_out = {int(x) for x in trainer._held_out[0].states[..., 0].unique()}
+    assert 5 <= len(held_out) < 20
+    seen = set()
+    gather = type(source).gather
+
+    def spy(self, starts, length):
+        windows = gather(self, starts, length)
+        seen.update(int(x) for x in windows.states[..., 0].unique())
+        return windows
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(type(source), "gather", spy)
+        trainer.train()
+    assert seen and not seen & held_out
+    # The normaliser saw no held-out state either
+    mean = th.tensor([x for x in range(20) if x not in held_out], dtype=th.float32).mean()
+    th.testing.assert_close(trainer.planner.normalizer.state_mean[0], mean)
+
+
+@pytest.mark.parametrize(
+    ("max_delay", "mask", "delays"), [(3, "random", range(4)), (8, "random", (0, 2, 4, 6, 8)), (8, "fixed", [8])]
+)
+def test_evaluation_covers_the_delays(max_delay, mask, delays):
+    metrics = make_trainer(max_delay=max_delay, mask=mask).evaluate()
+    expected = {
+        f"planner/{what}_error{who}_d{d}" for what in ("present", "action") for who in ("", "_mlp") for d in delays
+    }
+    assert set(metrics) == expected
+    assert all(len(key) <= 36 for key in metrics)  # longer ones are cut by the logger
+    if mask == "random":
+        assert metrics["planner/present_error_d0"] < 1e-5  # nothing is hidden there
+
+
+def test_evaluation_s_windows_reach_the_decision():
+    trainer = make_trainer(source=make_source(40, 5), max_delay=3)
+    windows, delay = trainer._held_out
+    assert set(delay.tolist()) == {0, 1, 2, 3}
+    assert windows.valid[th.arange(len(delay)), delay].all()
+
+
+def test_global_generator_is_neither_read_nor_moved():
+    states = []
+    for seed in (0, 1):
+        th.manual_seed(seed)
+        trainer = make_trainer()
+        before = th.random.get_rng_state()
+        trainer.train()
+        trainer.evaluate()
+        assert th.equal(th.random.get_rng_state(), before)
+        states.append(trainer.state_dict())
+    assert_same(*states)
+
+
+def test_errors_decrease():
+    trainer = make_trainer(gradient_steps=150, batch_size=64, ema_decay=0.9, learning_rate=3e-3)
+    before = trainer.evaluate()
+    trainer.train(20)
+    first_loss = trainer.pop_losses()
+    trainer.train()
+    last_loss, after = trainer.pop_losses(), trainer.evaluate()
+    for name in ("planner/loss", "planner/loss_mlp"):
+        assert last_loss[name] < 0.8 * first_loss[name]
+    for name in ("present_error_d3", "present_error_mlp_d3"):
+        assert after[f"planner/{name}"] < 0.5 * before[f"planner/{name}"]
+
+
+def test_callback_can_stop():
+    trainer = make_trainer()
+    assert not trainer.train(callback=lambda t: t.n_updates < 3)
+    assert trainer.n_updates == 3
+
+
+def test_evaluation_sees_no_future_action():
+    """Errors are those of an agent: whatever is unknown at the decision may be anything."""
+    trainer = make_trainer()
+    windows, delay = trainer._held_out
+    before = trainer._action_history(windows.actions, delay)
+    for history, actions, d in zip(before, windows.actions, delay.tolist(), strict=True):
+        np.testing.assert_array_equal(history[D - d :], actions[:d])
+        np.testing.assert_array_equal(history[: D - d], 0.0)
+    guess = trainer.yardstick(windows.states[:, 0], windows.actions, delay)
+    unknown = th.arange(windows.actions.shape[1]) >= delay[:, None]
+    others = windows.actions.masked_fill(unknown[..., None], 7.0)
+    assert_same(dict(guess._asdict()), dict(trainer.yardstick(windows.states[:, 0], others, delay)._asdict()))
+
+
+def test_no_held_out_data():
+    trainer = make_trainer(held_out=0.0)
+    trainer.train(2)
+    assert trainer.evaluate() == {}
+
+
+def test_delay_zero_planner_trains():
+    trainer = make_trainer(max_delay=0)
+    trainer.train()
+    assert trainer.evaluate()["planner/action_error_d0"] > 0
+
+
+def test_infinite_loss_names_its_update(monkeypatch):
+    trainer = make_trainer(gradient_steps=200)
+    loss = trainer.online.loss
+
+    def breaks(*args, **kwargs):
+        return loss(*args, **kwargs) * (math.nan if trainer.n_updates >= 3 else 1.0)
+
+    monkeypatch.setattr(trainer.online, "loss", breaks)
+    with pytest.raises(FloatingPointError, match=r"update 3 \(of 200\)"):
+        trainer.train()
+    assert trainer.n_updates == 100  # looked at rarely, to keep a GPU busy
+    with pytest.raises(FloatingPointError):
+        trainer.state_dict()
+
+
+@pytest.mark.parametrize("arguments", [{"gradient_steps": 0}, {"held_out": 1.0}, {"held_out": -0.1}])
+def test_bad_arguments(arguments):
+    with pytest.raises(ValueError, match="gradient_steps >= 1 and held_out"):
+        make_trainer(**arguments)
+
+
+def test_data_of_other_sizes():
+    planner = InpaintingPlanner(STATE_DIM + 1, ACTION_DIM, D, PlannerConfig(depth=1, d_model=32))
+    with pytest.raises(ValueError, match=r"expects 3 observation .* have 2"):
+        PlannerTrainer(planner, make_source(10, 10), 10)
