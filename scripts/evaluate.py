@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import torch as th
-from runs import Run, answering, answers, load_run
+from runs import LoadedRun, answering, answers, load_run
 from tqdm import tqdm
 
 from sb3_said.evaluation import Summary, collect_observations, measure_latency, plots, rollout
@@ -71,9 +71,13 @@ def main(argv: list[str] | None = None) -> None:
     if args.num_threads is not None:
         th.set_num_threads(args.num_threads)
     try:
+        if args.plot is not None:
+            plots.panels()  # without matplotlib, fail now and not after the episodes
         run = load_run(args.run, args.algo, args.env, args.delay, args.device)
     except ValueError as error:
         parser.error(str(error))
+    except ImportError as error:
+        parser.exit(1, f"{error}\n")
 
     last_seed = args.seed + args.episodes - 1
     print(f"{run.info['algo']} on {run.info['env']}, delay {run.info['delay']}, reset seeds {args.seed}..{last_seed}")
@@ -99,7 +103,7 @@ def main(argv: list[str] | None = None) -> None:
         print(f"Wrote {args.plot}")
 
 
-def evaluate(run: Run, answer: str | None, args: argparse.Namespace) -> Summary:
+def evaluate(run: LoadedRun, answer: str | None, args: argparse.Namespace) -> Summary:
     """Play the episodes and time the decisions of one answer."""
     label = answer or run.info["algo"]
     deterministic = not args.stochastic
@@ -130,7 +134,7 @@ def print_table(summaries: list[Summary]) -> None:
         print(f"{s.label:10} {s.mean_return.value:12,.1f} {interval:>24} {s.mean_length.value:8,.1f}   {speed}")
 
 
-def origin(run: Run) -> dict[str, Any]:
+def origin(run: LoadedRun) -> dict[str, Any]:
     """Say what a reader needs to judge and repeat the numbers: command, date, machine, versions."""
     packages = ("sb3_said", "stable_baselines3", "torch", "gymnasium", "mujoco", "numpy")
     return {
@@ -156,12 +160,11 @@ def draw(path: Path, summaries: list[Summary], folder: Path) -> None:
     drawings: list[Any] = [partial(plots.plot_returns, summaries)]
     if any(folder.glob("*monitor.csv")):
         drawings.append(partial(plots.plot_learning_curve, folder))
-    progress = folder / "progress.csv"
-    header = progress.read_text().split("\n", 1)[0] if progress.is_file() else ""
+    headers = [path.read_text().split("\n", 1)[0] for path in folder.glob("progress*.csv")]
     drawings += [
-        partial(plots.plot_planner_errors, progress, kind)
+        partial(plots.plot_planner_errors, folder, kind)
         for kind in ("present", "action")
-        if f"planner/{kind}_error" in header
+        if any(f"planner/{kind}_error" in header for header in headers)
     ]
     axes = plots.panels(len(drawings))
     for ax, drawing in zip(axes, drawings, strict=True):

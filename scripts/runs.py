@@ -9,21 +9,19 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import rl_zoo3
 import yaml
 from gymnasium import spaces
 from rl_zoo3.utils import get_saved_hyperparams, get_wrapper_class
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
-from zoo import ALGOS
+from zoo import ALGOS, WRAPPER
 
+from sb3_said.delays import FixedDelay
 from sb3_said.evaluation.rollout import Observation
-
-DELAY_WRAPPER = "sb3_said.delays.DelayedObservationWrapper"
 
 
 @dataclass(frozen=True)
-class Run:
+class LoadedRun:
     """A trained agent, ready to play."""
 
     model: BaseAlgorithm
@@ -44,7 +42,7 @@ def load_run(
     delay: int | None = None,
     device: str = "auto",
     env_kwargs: dict[str, Any] | None = None,
-) -> Run:
+) -> LoadedRun:
     """Open a run.
 
     A run folder's YAML is read the way rl_zoo3 reads it, which can run code: open only folders that you trust. A
@@ -62,16 +60,15 @@ def load_run(
     hyperparams, args = _read_params(params)
     algo = algo or args.get("algo")
     env_id = env_id or getattr(args.get("env"), "gym_id", args.get("env"))
-    algos: dict[str, type[BaseAlgorithm]] = {**rl_zoo3.ALGOS, **ALGOS}
-    if algo not in algos:
-        raise ValueError(f"The algorithm of {file} is not known ({algo}): give --algo, one of {', '.join(algos)}.")
+    if algo not in ALGOS:
+        raise ValueError(f"The algorithm of {file} is not known ({algo}): give --algo, one of {', '.join(ALGOS)}.")
     if env_id is None:
         raise ValueError(f"The task of {file} is not known, since no run folder is around it: give --env.")
     for key in ("frame_stack", "vec_env_wrapper"):
         if hyperparams.get(key):
             raise ValueError(f"{file} was trained with {key}={hyperparams[key]}, which cannot be played here.")
 
-    model = algos[algo].load(file, device=device)
+    model = ALGOS[algo].load(file, device=device)
     wrappers = hyperparams.get("env_wrapper") or []
     wrappers = list(wrappers) if isinstance(wrappers, list) else [wrappers]
     if delay is not None or params is None:
@@ -85,16 +82,16 @@ def load_run(
 
     env = make_env()
     _check_spaces(model, env, file)
-    max_delay = getattr(env.get_wrapper_attr("process"), "max_delay", 0) if env.has_wrapper_attr("process") else 0
+    delay_process = env.get_wrapper_attr("process") if env.has_wrapper_attr("process") else FixedDelay(0)
     env.close()
     info = {
         "algo": algo,
         "env": env_id,
-        "delay": max_delay if delay is None else delay,
+        "delay": delay_process.delay if isinstance(delay_process, FixedDelay) else str(delay_process),
         "file": str(file),
         "trained_steps": model.num_timesteps,
     }
-    return Run(model, make_env, _load_normalize(params, hyperparams, make_env), file.parent, info)
+    return LoadedRun(model, make_env, _load_normalize(params, hyperparams, make_env), file.parent, info)
 
 
 def answers(model: BaseAlgorithm) -> list[str]:
@@ -163,9 +160,9 @@ def _with_delay(wrappers: list[Any], delay: int | None, model: BaseAlgorithm) ->
         raise ValueError(f"This agent was built for delays 0..{max_delay}, got --delay {delay}.")
     kwargs = {"delay": max_delay if delay is None else delay, "max_delay": max_delay}
     names = [next(iter(w)) if isinstance(w, dict) else w for w in wrappers]
-    delayed = [str(name).endswith("DelayedObservationWrapper") for name in names]
+    delayed = [str(name).endswith(WRAPPER.rsplit(".", 1)[1]) for name in names]
     if not any(delayed):
-        return [*wrappers, {DELAY_WRAPPER: kwargs}]
+        return [*wrappers, {WRAPPER: kwargs}]
     return [
         {name: {**(w[name] if isinstance(w, dict) else {}), **kwargs}} if is_delay else w
         for w, name, is_delay in zip(wrappers, names, delayed, strict=True)

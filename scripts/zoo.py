@@ -52,11 +52,12 @@ def default_preset() -> str:
     return "paper" if th.cuda.is_available() else "cpu"
 
 
-def preset_overrides(config: str | Path, preset: str, env_id: str) -> dict[str, Any]:
+def preset_overrides(config: str | Path, preset: str, env_id: str, delay: list[int]) -> dict[str, Any]:
     """Return what a preset changes for a task: its own entry of ``presets:`` in the file, or the preset's default.
 
     ``cpu`` is what the file says outside ``presets:``, so that rl_zoo3 alone reads it too.
 
+    :param delay: one number, or low and high; ``planner_by_delay`` is looked up by the largest
     :raises ValueError: for a preset the file does not have
     """
     if preset == "cpu":
@@ -64,7 +65,11 @@ def preset_overrides(config: str | Path, preset: str, env_id: str) -> dict[str, 
     presets = (yaml.safe_load(Path(config).read_text()) or {}).get("presets", {})
     if preset not in presets:
         raise ValueError(f"{config} has no preset '{preset}', only {['cpu', *presets]}.")
-    return dict(presets[preset].get(env_id, presets[preset]["default"]))
+    overrides = dict(presets[preset].get(env_id, presets[preset]["default"]))
+    tuned = overrides.pop("planner_by_delay", {}).get(max(delay, default=0))
+    if tuned is not None:
+        overrides["planner_kwargs"] = {**overrides["planner_kwargs"], "depth": tuned[0], "temperature": tuned[1]}
+    return overrides
 
 
 @dataclass(frozen=True)
@@ -108,11 +113,17 @@ class DelayedExperimentManager(ExperimentManager):
             self.save_path += zoo_kwargs["uuid_str"]
         self.params_path = f"{self.save_path}/{self.env_name}"
 
-        overrides = preset_overrides(self.config, run.preset, env_id)
+        overrides = preset_overrides(self.config, run.preset, env_id, run.delay)
         overrides |= ALGORITHMS[algo][1]
         if run.delay:
             overrides["env_wrapper"] = [{WRAPPER: {"delay": run.delay[0] if len(run.delay) == 1 else list(run.delay)}}]
         self.custom_hyperparams = {**overrides, **(self.custom_hyperparams or {})}
+        planner_kwargs = self.custom_hyperparams.get("planner_kwargs")
+        if len(run.delay) == 2 and isinstance(planner_kwargs, dict) and planner_kwargs.get("mask") == "fixed":
+            raise ValueError(
+                f"A planner with mask='fixed' serves one delay, got --delay {run.delay[0]} {run.delay[1]}; "
+                "use mask='random' (another --preset, or -params planner_kwargs:\"dict(mask='random')\")."
+            )
 
     @property
     def checkpoint(self) -> Path:
@@ -141,11 +152,13 @@ class DelayedExperimentManager(ExperimentManager):
             restore_training(model, self.checkpoint, CallbackList(self.callbacks))  # type: ignore[arg-type]
             print(f"Resuming {self.save_path} at step {model.num_timesteps}")
         model.set_logger(self._logger(model))
+        # rl_zoo3: -1 is the default, anything below logs nothing by itself
+        log_interval = {-1: 4}.get(self.log_interval, self.log_interval if self.log_interval > 0 else None)
         try:
             model.learn(
                 max(self.n_timesteps - model.num_timesteps, 0),
                 callback=self.callbacks,
-                log_interval=self.log_interval if self.log_interval > -1 else 4 if self.log_interval == -1 else None,
+                log_interval=log_interval,  # type: ignore[arg-type]  # SB3 takes None and says so in its docstring
                 reset_num_timesteps=not resumes,
             )
         except KeyboardInterrupt:

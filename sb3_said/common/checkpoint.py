@@ -54,7 +54,7 @@ class TrainingCheckpointCallback(BaseCallback):
     def save(self) -> None:
         """Write a checkpoint now."""
         assert isinstance(self.model, OffPolicyAlgorithm)
-        save_tree(self.path, training_state(self.model, self.parent))
+        save_tree(self.path, training_state(self.model, self.locals.get("callback")))
         self._saved_at = self.model.num_timesteps
 
 

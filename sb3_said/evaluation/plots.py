@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,23 +24,26 @@ UPDATES = "planner/n_updates"
 
 
 def panels(n: int = 1, width: float = 5.0, height: float = 3.6) -> list[Axes]:
-    """Make a figure of n panels side by side.
+    """Make a figure of n panels, up to three side by side, more in two rows.
 
     :param n: panels
     :param width: of each panel, inches
-    :param height: inches
+    :param height: of each panel, inches
     :raises ImportError: without matplotlib
     """
     try:
         from matplotlib.figure import Figure  # no pyplot: needs no display, and leaves the caller's backend alone
     except ImportError as error:
         raise ImportError('Plots need matplotlib: pip install "sb3_said[plots]"') from error
-    axes = Figure(figsize=(n * width, height), dpi=150, layout="constrained").subplots(1, n, squeeze=False)[0]
+    rows = 1 if n <= 3 else 2
+    columns = math.ceil(n / rows)
+    figure = Figure(figsize=(columns * width, rows * height), dpi=150, layout="constrained")
+    axes = [figure.add_subplot(rows, columns, i + 1) for i in range(n)]
     for ax in axes:
         ax.spines[["top", "right"]].set_visible(False)
         ax.grid(axis="y", alpha=0.3)
         ax.set_axisbelow(True)
-    return list(axes)
+    return axes
 
 
 def save(ax: Axes, path: str | Path) -> None:
@@ -111,52 +115,62 @@ def plot_returns(summaries: Sequence[Summary], ax: Axes | None = None) -> Axes:
     return ax
 
 
-def plot_planner_errors(progress: str | Path, kind: Literal["present", "action"], ax: Axes | None = None) -> Axes:
+def plot_planner_errors(run: str | Path, kind: Literal["present", "action"], ax: Axes | None = None) -> Axes:
     """Plot how far the planner is off on held-out windows, beside an MLP regression trained on the same windows.
 
     One colour for each delay d; solid lines are the planner's ``planner/{kind}_error_d*``, dashed ones the MLP's
     ``planner/{kind}_error_mlp_d*``. A planner above its dashed line is not trained yet.
 
-    :param progress: SB3's ``progress.csv``
+    :param run: folder with SB3's ``progress.csv``, and ``progress_STEPS.csv`` where the training was resumed
     :param kind: "present", the error of the decoded present state in standard deviations of the states; or "action",
         the error of the decision in environment units
     :param ax: to draw on; a new figure by default
-    :raises ValueError: when the file holds no such error
+    :raises ValueError: when the folder holds no such error
     """
-    rows = list(csv.DictReader(Path(progress).read_text().splitlines()))
+    files = sorted(
+        Path(run).glob("progress*.csv"), key=lambda file: int(file.stem.removeprefix("progress").strip("_") or 0)
+    )
+    rows = [row for file in files for row in csv.DictReader(file.read_text().splitlines())]
+    names = {name for row in rows for name in row}
     pattern = re.compile(rf"planner/{kind}_error(_mlp)?_d(\d+)")
-    columns = {key: match for key in (rows[0] if rows else {}) if (match := pattern.fullmatch(key))}
+    columns = {name: match for name in names if (match := pattern.fullmatch(name))}
     if not columns:
         raise ValueError(
-            f"{progress} has no column planner/{kind}_error_d*; give the progress.csv of a planner's training."
+            f"{run} has no progress.csv with planner/{kind}_error_d*; give the run of a planner's training."
         )
     ax = panels()[0] if ax is None else ax
     # Over both kinds, so that a delay has the same colour in both plots.
-    delays = sorted({int(d) for key in rows[0] for d in re.findall(r"planner/\w+_error(?:_mlp)?_d(\d+)", key)})
+    delays = sorted({int(d) for name in names for d in re.findall(r"planner/\w+_error(?:_mlp)?_d(\d+)", name)})
     updates = _running_total([float(row.get(UPDATES) or 0.0) for row in rows])
     for column, match in sorted(columns.items(), key=lambda item: (int(item[1][2]), item[0])):
-        points = [(x, float(row[column])) for x, row in zip(updates, rows, strict=True) if row[column]]
+        points = [(x, float(row[column])) for x, row in zip(updates, rows, strict=True) if row.get(column)]
         ax.plot(
             *zip(*points, strict=True),
             color=COLORS[delays.index(int(match[2])) % len(COLORS)],
             linestyle="--" if match[1] else "-",
+            marker=".",
             label=f"{'MLP' if match[1] else 'planner'}, d = {match[2]}",
         )
     ax.set_xlabel("planner updates")
     unit = {"present": "standard deviations", "action": "environment units"}[kind]
     ax.set_ylabel(f"{kind}{'-state' if kind == 'present' else ''} error ({unit})")
     ax.set_ylim(bottom=0)
-    ax.legend(frameon=False, fontsize="small")
+    ax.legend(frameon=False, fontsize="small", ncols=2 if len(columns) > 6 else 1)
     return ax
 
 
 def _running_total(counts: Sequence[float]) -> list[float]:
-    """Join counts that start anew with each training into one count."""
-    total, last, joined = 0.0, 0.0, []
+    """Join counts of updates, which start anew with each training of the planner, into one count.
+
+    A resumed training steps back as well, but not to where its first row was: it goes on from its checkpoint.
+    """
+    first = next((count for count in counts if count > 0), 0.0)
+    before, last, joined = 0.0, 0.0, []
     for count in counts:
-        total += max(last, 0.0) if count < last else 0.0
-        joined.append(total + count)
-        last = count
+        if 0 < count < last and count <= first:
+            before += last
+        last = count or last
+        joined.append(before + last)
     return joined
 
 

@@ -80,7 +80,7 @@ def rollout(
     :param env: an environment id, or a function that makes an environment
     :param n_episodes: >= 1
     :param seed: reset seed of episode 0; take seeds that training and tuning never saw
-    :param n_envs: environments in lock-step, >= 1; the first decision of a call uses as many of them
+    :param n_envs: environments in lock-step, >= 1; the largest batch that ``predict`` is asked for
     :param deterministic: handed to ``predict``
     :param normalize: applied to batched observations before ``predict``, such as ``VecNormalize.normalize_obs``
     :param on_step: called with the environment after every step, for instance to render it

@@ -113,6 +113,10 @@ class SAIDPolicy(DelayedSACPolicy):
     def _plan(self, observation: dict[str, th.Tensor], noise: th.Tensor | None = None) -> th.Tensor:
         """Return the decision of each row: (B, act_dim)."""
         delay = observation["delay"][:, 0].round().long()
+        if self.planner.config.mask == "fixed":
+            # Only D known actions were ever trained. At an episode's start, s_0 then stands for s_{t-D} and zeros for
+            # the actions before it (paper, Appendix B).
+            delay = th.full_like(delay, self.max_delay)
         return self.planner.plan(
             observation["observation"], observation["action_history"], delay, value_fn=self.value, noise=noise
         ).action

@@ -64,16 +64,18 @@ def test_planner_errors(tmp_path: Path, png: Path) -> None:
         "2.0,,,,,200\n"
         ",0.5,0.4,0.2,0.2,100\n"  # a second training counts from zero again
     )
+    (tmp_path / "progress_500.csv").write_text("planner/action_error_d4,planner/n_updates\n0.15,200\n")
     left, right = plots.panels(2)
-    assert len(plots.plot_planner_errors(progress, "present", left).lines) == 2
-    plots.plot_planner_errors(progress, "action", right)
-    np.testing.assert_array_equal(right.lines[0].get_xydata(), [[100, 0.4], [200, 0.3], [300, 0.2]])
+    assert len(plots.plot_planner_errors(tmp_path, "present", left).lines) == 2
+    plots.plot_planner_errors(tmp_path, "action", right)
+    np.testing.assert_array_equal(right.lines[0].get_xydata(), [[100, 0.4], [200, 0.3], [300, 0.2], [400, 0.15]])
     assert [line.get_label() for line in right.lines] == ["planner, d = 4", "MLP, d = 4"]
     plots.save(left, png)
     assert drawn(png)
+    (tmp_path / "progress_500.csv").unlink()
     progress.write_text("rollout/ep_rew_mean\n1.0\n")
-    with pytest.raises(ValueError, match="no column"):
-        plots.plot_planner_errors(progress, "present")
+    with pytest.raises(ValueError, match="has no progress"):
+        plots.plot_planner_errors(tmp_path, "present")
 
 
 def test_without_matplotlib_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,278 @@
+"""A search over planner depth and temperature that several workers share, kept in an Optuna study."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import optuna
+from optuna.distributions import CategoricalDistribution, FloatDistribution
+from optuna.importance import BaseImportanceEvaluator
+from optuna.storages import BaseStorage, JournalStorage, RDBStorage
+from optuna.storages.journal import JournalFileBackend
+from optuna.trial import FrozenTrial, Trial, TrialState
+
+from sb3_said.said.tuning import Claim, DepthPlanners
+
+warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
+optuna.logging.set_verbosity(optuna.logging.WARNING)
+
+#: Returns (n,) of the agent, in n episodes from a reset seed on.
+Play = Callable[[int, int], Sequence[float]]
+
+
+@dataclass
+class Search:
+    """Depths and temperatures tried on the same episodes, the best mean return wins.
+
+    With the sampler ``grid`` every cell is tried once. The cells are handed out here, as Optuna's ``GridSampler`` now
+    and then gives two workers the same one, and does not know that a depth is being trained: a worker takes a trained
+    depth first, and then one that nobody is training. ``tpe`` draws temperatures between the lowest and the highest.
+
+    A trial reports the return of every episode; it is pruned once a Wilcoxon test of the differences to the best trial,
+    episode by episode, says that it is worse.
+
+    :param folder: shared by the workers, for their locks
+    :param storage: an Optuna RDB URL, or the path of a journal file
+    :param name: of the study
+    :param settings: in JSON types, what all trials must have in common to be compared
+    :param n_trials: of the whole study, over all workers
+    :param episodes: of a trial
+    :param round_size: episodes between two looks at pruning
+    :param seed: reset seed of the first episode
+    :param prune: p-value below which a trial is pruned; 0 prunes none
+    :raises ValueError: when the study was made with other settings
+    """
+
+    folder: Path
+    storage: str
+    name: str
+    depths: list[int]
+    temperatures: list[float]
+    sampler: str = "grid"
+    n_trials: int | None = None
+    episodes: int = 20
+    round_size: int = 5
+    seed: int = 20_000
+    prune: float = 0.05
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        common = {**self.settings, "sampler": self.sampler, "episodes": self.episodes, "seed": self.seed}
+        if self.sampler == "tpe":
+            common |= {"depths": self.depths, "temperatures": [min(self.temperatures), max(self.temperatures)]}
+        pruner = optuna.pruners.WilcoxonPruner(p_threshold=self.prune) if self.prune > 0 else optuna.pruners.NopPruner()
+        with self._lock():
+            self.study = optuna.create_study(
+                storage=open_storage(self.storage),
+                study_name=self.name,
+                direction="maximize",
+                load_if_exists=True,
+                pruner=pruner,
+                sampler=optuna.samplers.RandomSampler(),
+            )
+            before = self.study.user_attrs.get("settings")
+            if before is None:
+                self.study.set_user_attr("settings", common)
+        if before is not None and before != common:
+            differing = [key for key in sorted({*before, *common}) if before.get(key) != common.get(key)]
+            raise ValueError(
+                f"Study {self.name!r} in {self.storage} was begun with other settings: "
+                + "; ".join(f"{key} was {before.get(key)} and is now {common.get(key)}" for key in differing)
+                + ". Go on with the old ones, or begin another with --study-name."
+            )
+
+    @property
+    def limit(self) -> float:
+        """Trials that the study may have; a grid ends by itself."""
+        if self.n_trials is not None:
+            return self.n_trials
+        return math.inf if self.sampler == "grid" else len(self.depths) * len(self.temperatures)
+
+    def work(self, planners: DepthPlanners, play: Play, deadline: float | None = None) -> None:
+        """Make trials until there is none left to begin.
+
+        :param planners: of the agent that plays
+        :param play: plays episodes
+        :param deadline: ``time.monotonic()`` after which none is begun
+        """
+        while deadline is None or time.monotonic() < deadline:
+            begun = self._begin(planners)
+            if begun is None:
+                return
+            trial, claim = begun
+            depth, temperature = trial.params["depth"], trial.params["temperature"]
+            try:
+                planners.put(depth, temperature)
+                returns = self._play(trial, play)
+            except BaseException:
+                self.study.tell(trial, state=TrialState.FAIL, skip_if_finished=True)
+                raise
+            finally:
+                claim.release()
+            pruned = "" if len(returns) == self.episodes else " (pruned)"
+            print(
+                f"trial {trial.number}: depth {depth}, temperature {temperature:g}: mean return "
+                f"{np.mean(returns):,.1f} over {len(returns)} episodes{pruned}",
+                flush=True,
+            )
+
+    def running(self) -> list[FrozenTrial]:
+        """Return the trials that a living worker is at."""
+        trials = self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
+        return [trial for trial in trials if self._claim(trial).holder() is not None]
+
+    def finished(self) -> list[FrozenTrial]:
+        """Return the trials that are complete or pruned."""
+        return self.study.get_trials(states=(TrialState.COMPLETE, TrialState.PRUNED))
+
+    def winner(self) -> FrozenTrial | None:
+        """Return the complete trial of the highest mean; of equals, the shallowest and coldest."""
+        complete = [trial for trial in self.finished() if trial.state == TrialState.COMPLETE]
+        return max(complete, key=lambda t: (t.value, -t.params["depth"], -t.params["temperature"]), default=None)
+
+    def _begin(self, planners: DepthPlanners) -> tuple[Trial, Claim] | None:
+        with self._lock():
+            for trial in self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
+                if self._claim(trial).holder() is None:
+                    self.study.tell(trial.number, state=TrialState.FAIL)  # its worker died; the cell is free again
+            taken = [trial for trial in self.study.get_trials(deepcopy=False) if trial.state != TrialState.FAIL]
+            waiting = [trial for trial in taken if trial.state == TrialState.WAITING]
+            if not waiting and len(taken) >= self.limit:
+                return None
+            if self.sampler == "tpe":
+                # Seeded by what is there: no two workers draw alike, and one worker alone repeats itself.
+                seed = self.seed + len(self.study.get_trials(deepcopy=False))
+                self.study.sampler = optuna.samplers.TPESampler(seed=seed, n_startup_trials=6, constant_liar=True)
+            elif not waiting:
+                cell = self._next_cell(planners, taken)
+                if cell is None:
+                    return None
+                self.study.enqueue_trial({"depth": cell[0], "temperature": cell[1]}, {"worker": os.getpid()})
+            begun = self.study.ask()
+            if self.sampler == "tpe":
+                begun.suggest_categorical("depth", self.depths)
+            else:  # an int, so that depths can be added to a study later
+                begun.suggest_int("depth", min(self.depths), max(self.depths))
+            begun.suggest_float("temperature", min(self.temperatures), max(self.temperatures))
+            claim = self._claim(begun)
+            claim.try_acquire()
+        return begun, claim
+
+    def _next_cell(self, planners: DepthPlanners, taken: list[FrozenTrial]) -> tuple[int, float] | None:
+        seen = {(t.params["depth"], t.params["temperature"]) for t in taken}
+        left = [cell for depth in self.depths for t in self.temperatures if (cell := (depth, float(t))) not in seen]
+        busy = {depth: not planners.is_ready(depth) and planners.claim(depth).holder() is not None for depth, _ in left}
+        # A worker that has just begun a depth holds its claim a moment later; its running trial says so already.
+        running = {t.params["depth"] for t in taken if t.state == TrialState.RUNNING}
+        rank = {d: 0 if planners.is_ready(d) else 2 if busy[d] or d in running else 1 for d in busy}
+        return min(left, key=lambda cell: rank[cell[0]], default=None)
+
+    def _play(self, trial: Trial, play: Play) -> list[float]:
+        returns: list[float] = []
+        for start in range(0, self.episodes, self.round_size):
+            for value in play(self.seed + start, min(self.round_size, self.episodes - start)):
+                trial.report(float(value), len(returns))
+                returns.append(float(value))
+            if len(returns) < self.episodes and trial.should_prune():
+                self.study.tell(trial, state=TrialState.PRUNED)
+                return returns
+        self.study.tell(trial, float(np.mean(returns)))
+        return returns
+
+    def _lock(self) -> Claim:
+        return Claim(self.folder / "locks" / f"{self.name}.lock")
+
+    def _claim(self, trial: Trial | FrozenTrial) -> Claim:
+        return Claim(self.folder / "locks" / f"{self.name}_trial{trial.number}.lock")
+
+
+def open_storage(storage: str) -> BaseStorage:
+    """Open an RDB by its URL, or a journal file by its path."""
+    if "://" in storage:
+        return RDBStorage(storage)
+    Path(storage).parent.mkdir(parents=True, exist_ok=True)
+    return JournalStorage(JournalFileBackend(storage))
+
+
+def returns_of(trial: FrozenTrial) -> list[float]:
+    """Return what a trial reported: the return of each of its episodes, in the order of their seeds."""
+    return [trial.intermediate_values[step] for step in sorted(trial.intermediate_values)]
+
+
+class MainEffects(BaseImportanceEvaluator):
+    """Part of the variance of the trials that the mean over each level of a parameter explains.
+
+    For a whole grid these are the main effects of functional ANOVA. Optuna's own evaluators estimate densities or fit
+    forests, which a dozen trials do not bear.
+
+    :param levels: values of each parameter; others count as the nearest
+    """
+
+    def __init__(self, levels: dict[str, Sequence[float]]):
+        self.levels = {name: np.array(sorted(values)) for name, values in levels.items()}
+
+    def evaluate(
+        self,
+        study: optuna.Study,
+        params: list[str] | None = None,
+        *,
+        target: Callable[[FrozenTrial], float] | None = None,
+    ) -> dict[str, float]:
+        trials = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+        values = np.array([trial.value if target is None else target(trial) for trial in trials])
+        effects = {}
+        for name in params or self.levels:
+            given = np.array([trial.params[name] for trial in trials], float)
+            level = np.abs(given[:, None] - self.levels[name]).argmin(1)
+            means = np.array([values[level == k].mean() for k in level])
+            effects[name] = float(means.var() / values.var()) if values.var() > 0 else 0.0
+        return dict(sorted(effects.items(), key=lambda item: -item[1]))
+
+
+def save_plots(search: Search, folder: Path) -> list[Path]:
+    """Draw how much each parameter matters and how each does, pruned trials by the mean as far as they got.
+
+    :return: the files; none where there is nothing to compare yet
+    :raises ImportError: without matplotlib
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from optuna.visualization import matplotlib as draw
+
+    trials = search.finished()
+    levels: dict[str, list[Any]] = {
+        "depth": sorted({t.params["depth"] for t in trials}),
+        "temperature": sorted({t.params["temperature"] for t in trials}),
+    }
+    varied = [name for name, values in levels.items() if len(values) > 1]
+    if not varied:
+        return []
+    whole = optuna.create_study(direction="maximize")
+    for trial in trials:
+        distributions = {
+            "depth": CategoricalDistribution(levels["depth"]),
+            "temperature": FloatDistribution(levels["temperature"][0], levels["temperature"][-1]),
+        }
+        value = float(np.mean(returns_of(trial)))
+        whole.add_trial(optuna.trial.create_trial(value=value, params=trial.params, distributions=distributions))
+    grid = {name: levels[name] if name == "depth" else search.temperatures for name in varied}
+    paths = [folder / "importance.png", folder / "slice.png"]
+    for path, drawing in (
+        (paths[0], lambda: draw.plot_param_importances(whole, MainEffects(grid), varied)),
+        (paths[1], lambda: draw.plot_slice(whole, varied, target_name="mean return")),
+    ):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            axes = np.ravel(drawing())
+        axes[0].figure.savefig(path, dpi=150, bbox_inches="tight")
+        matplotlib.pyplot.close(axes[0].figure)
+    return paths

@@ -1,0 +1,393 @@
+"""Search the planner's depth and temperature for a trained SAID run, sharing its expert and its replay."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shlex
+import shutil
+import time
+from argparse import Namespace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import torch as th
+import yaml
+from evaluate import evaluate, origin
+from optuna.trial import FrozenTrial
+from runs import LoadedRun, _read_params, load_run
+from study import Search, returns_of, save_plots
+from zoo import PRESETS, WRAPPER
+
+from sb3_said import SAID
+from sb3_said.common.checkpoint import CHECKPOINT_NAME
+from sb3_said.evaluation import bootstrap_interval, rollout
+from sb3_said.planner import PlannerConfig
+from sb3_said.said.tuning import Claim, DepthPlanners
+
+EPILOG = """\
+examples:
+  # the paper's grid: three planners are trained, each is tried at six temperatures
+  python scripts/tune.py --run logs/said/Hopper-v5-delay4_1
+
+  # the same with two workers, here or on machines that share the folder; run it again to go on after a crash
+  python scripts/tune.py --run logs/said/Hopper-v5-delay4_1 --num-threads 1 & \\
+  python scripts/tune.py --run logs/said/Hopper-v5-delay4_1 --num-threads 1
+
+  # a quick look: one depth, fewer updates, fewer episodes, into a folder of its own
+  python scripts/tune.py --run logs/said/Hopper-v5-delay4_1 --depths 2 --gradient-steps 5000 --episodes 10 \\
+      --output /tmp/look
+
+  # any temperature from 0 to 1, in a data base
+  python scripts/tune.py --run logs/said/Hopper-v5-delay4_1 --sampler tpe --n-trials 30 --storage sqlite:///tune.db
+
+  # afterwards: train with the winner, or play it
+  python scripts/train.py --algo said --env Hopper-v5 --delay 4 -conf logs/said/Hopper-v5-delay4_1/tune/best.yml
+  python scripts/evaluate.py logs/said/Hopper-v5-delay4_1/tune/best.zip
+
+A run is what train.py --algo said left: its expert collects nothing more, its replay trains one planner per depth.
+Every trial plays the same episodes, --seed and up; one that is clearly worse than the best, episode by episode, is
+pruned. The winner, and the expert beside it, are reported on other episodes, --report-seed and up, since the best of
+many trials looks better on its own episodes than it is.
+
+Written to RUN_DIR/tune: planner_depthN.zip, study.log (the study), and by the worker that ends last results.json,
+best.yml, best.zip, importance.png and slice.png.
+A run folder's YAML can run code (rl_zoo3 reads it so): open only folders that you trust.
+"""
+
+
+def make_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--run", type=Path, required=True, metavar="RUN_DIR", help="folder that train.py left")
+    parser.add_argument("--depths", type=int, nargs="+", default=[2, 4, 8], help="default: 2 4 8")
+    parser.add_argument(
+        "--temperatures",
+        type=float,
+        nargs="+",
+        default=[0.0, 0.1, 0.3, 0.6, 0.8, 1.0],
+        help="default: 0 0.1 0.3 0.6 0.8 1",
+    )
+    parser.add_argument("--sampler", choices=("grid", "tpe"), default="grid", help="default: grid, every cell once")
+    parser.add_argument("--n-trials", type=int, help="trials of the whole study (default: as many as the grid has)")
+    parser.add_argument("--gradient-steps", type=int, help="updates of each planner (default: as the run's)")
+    parser.add_argument("--episodes", type=int, default=20, help="whole episodes of a trial (default: 20)")
+    parser.add_argument(
+        "--round", type=int, default=5, help="episodes side by side, between two looks at pruning (default: 5)"
+    )
+    parser.add_argument(
+        "--prune",
+        type=float,
+        default=0.05,
+        metavar="P",
+        help="p-value of the paired test below which a trial is pruned; 0: never (default: 0.05)",
+    )
+    parser.add_argument("--seed", type=int, default=20_000, help="reset seed of the first episode (default: 20000)")
+    parser.add_argument("--report-episodes", type=int, default=50, help="of the winner and the expert (default: 50)")
+    parser.add_argument(
+        "--report-seed", type=int, default=10_000, help="reset seed of the first of those (default: 10000)"
+    )
+    parser.add_argument(
+        "--storage", help="Optuna RDB URL, or path of a journal file (default: study.log in the output folder)"
+    )
+    parser.add_argument("--study-name", help="default: the run folder's name")
+    parser.add_argument("--output", type=Path, metavar="DIR", help="default: RUN_DIR/tune")
+    parser.add_argument("--timeout", type=float, metavar="SECONDS", help="begin no trial after this time")
+    parser.add_argument("--device", default="auto", help="torch device (default: auto)")
+    parser.add_argument("--num-threads", type=int, help="torch threads (default: torch's own choice)")
+    parser.add_argument("-P", "--progress", action="store_true", help="show a progress bar while a planner trains")
+    return parser
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = make_parser()
+    args = parser.parse_args(argv)
+    if args.num_threads is not None:
+        th.set_num_threads(args.num_threads)
+    try:
+        check(args)
+        tune(args)
+    except ValueError as error:
+        parser.error(str(error))
+    except KeyboardInterrupt:
+        parser.exit(130, "\nInterrupted; the same command goes on.\n")
+
+
+def check(args: argparse.Namespace) -> None:
+    """
+    :raises ValueError: for options that make no search
+    """
+    for name in ("episodes", "round", "report_episodes", "n_trials", "gradient_steps"):
+        value = getattr(args, name)
+        if value is not None and value < 1:
+            raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {value}.")
+    if not 0 <= args.prune < 1:
+        raise ValueError(f"--prune is a p-value in [0, 1), got {args.prune}; 0 prunes nothing.")
+    if args.prune > 0 and find_spec("scipy") is None:
+        raise ValueError("Pruning needs SciPy: pip install scipy, or give --prune 0.")
+    for name in ("depths", "temperatures"):
+        values = getattr(args, name)
+        if len(set(values)) < len(values):
+            raise ValueError(f"--{name} names a value twice: {' '.join(f'{value:g}' for value in values)}.")
+    if args.seed < args.report_seed + args.report_episodes and args.report_seed < args.seed + args.episodes:
+        raise ValueError(
+            f"Tuning would play the reset seeds {args.seed}..{args.seed + args.episodes - 1} and the report "
+            f"{args.report_seed}..{args.report_seed + args.report_episodes - 1}: a report on episodes that were tuned "
+            "on is too good. Move --report-seed or --seed so that they do not overlap."
+        )
+
+
+def tune(args: argparse.Namespace) -> None:
+    """Search, and report unless another worker is still searching.
+
+    :raises ValueError: when the run cannot be tuned, or the output folder holds another search
+    """
+    run, model = open_run(args)
+    folder = args.output or args.run / "tune"
+    planners = DepthPlanners(model, args.run / CHECKPOINT_NAME, folder, args.gradient_steps, args.progress)
+    for depth in args.depths:
+        for temperature in args.temperatures:
+            PlannerConfig(**{**planners.base_kwargs, "depth": depth, "temperature": temperature})
+    settings = {**planners.settings(args.depths[0]), "env": run.info["env"], "delay": run.info["delay"]}
+    settings["config"] = {key: value for key, value in settings["config"].items() if key != "depth"}
+    search = Search(
+        folder,
+        args.storage or str(folder / "study.log"),
+        args.study_name or args.run.resolve().name,
+        args.depths,
+        args.temperatures,
+        args.sampler,
+        args.n_trials,
+        args.episodes,
+        args.round,
+        args.seed,
+        args.prune,
+        settings,
+    )
+    n_before = len(search.finished())
+    print(
+        f"{run.info['env']}, delay {run.info['delay']}: {n_before} trials are finished in {search.storage}", flush=True
+    )
+
+    def play(seed: int, n: int) -> list[float]:
+        played = rollout(model, run.make_env, n, seed, n, deterministic=True, normalize=run.normalize)
+        return [float(value) for value in played.returns]
+
+    search.work(planners, play, None if args.timeout is None else time.monotonic() + args.timeout)
+
+    others = search.running()
+    if others:
+        print(f"{len(others)} trials are still running in other workers; the last worker reports.")
+        return
+    winner = search.winner()
+    if winner is None:
+        raise ValueError("No trial is finished, so there is no winner: give more --timeout or --n-trials.")
+    reporting = Claim(folder / "locks" / "report.lock")
+    if not reporting.try_acquire():
+        print(f"Another worker reports ({reporting.holder()}).")
+        return
+    try:
+        report(args, run, search, planners, winner, folder)
+    finally:
+        reporting.release()
+
+
+def open_run(args: argparse.Namespace) -> tuple[LoadedRun, SAID]:
+    """Open the run to tune.
+
+    :raises ValueError: when it is not a run of SAID with its replay
+    """
+    run = load_run(args.run, device=args.device)
+    if not isinstance(run.model, SAID):
+        raise ValueError(f"{args.run} is a run of '{run.info['algo']}', which has no planner; give one of --algo said.")
+    if not args.run.is_dir() or not (args.run / CHECKPOINT_NAME).is_file():
+        raise ValueError(
+            f"{args.run} has no {CHECKPOINT_NAME}, whose replay the planners are trained on; give the folder that "
+            "train.py left, and finish the run if it was stopped: python scripts/train.py --resume RUN_DIR"
+        )
+    if run.normalize is not None:  # the bound method of the run's VecNormalize, which the replay needs too
+        run.model._vec_normalize_env = run.normalize.__self__  # type: ignore[attr-defined]
+    return run, run.model
+
+
+def report(
+    args: argparse.Namespace,
+    run: LoadedRun,
+    search: Search,
+    planners: DepthPlanners,
+    winner: FrozenTrial,
+    folder: Path,
+) -> None:
+    """Play the winner and the expert on fresh episodes and write everything that the search found."""
+    planners.put(winner.params["depth"], winner.params["temperature"])
+    fresh = {
+        "study": search.name,
+        "storage": search.storage,
+        "trial": winner.number,
+        "seed": args.report_seed,
+        "n_episodes": args.report_episodes,
+    }
+    results = folder / "results.json"
+    before = json.loads(results.read_text()).get("report", {}) if results.is_file() else {}
+    if {key: before.get(key) for key in fresh} == fresh and (folder / "best.zip").is_file():
+        played = before["results"]
+    else:
+        how = Namespace(
+            episodes=args.report_episodes, seed=args.report_seed, n_envs=8, stochastic=False, latency_calls=100
+        )
+        played = [evaluate(run, answer, how).to_dict() for answer in ("planner", "expert")]
+    assert isinstance(run.model, SAID)
+    run.model.save(folder / "best.zip")
+    notes = write_configs(args, search, winner, folder)
+
+    trials = [trial_to_dict(trial, args.seed) for trial in search.finished()]
+    document = {
+        **run.info,
+        "settings": search.study.user_attrs["settings"],
+        "trials": trials,
+        "winner": {**trial_to_dict(winner, args.seed), "agent": str(folder / "best.zip")},
+        "report": {**fresh, "deterministic": True, "results": played},
+        "origin": origin(run),
+    }
+    write_text(results, json.dumps(document, indent=2, allow_nan=False) + "\n")
+
+    pruned = sum(trial["state"] == "PRUNED" for trial in trials)
+    print(f"\n{len(trials)} trials, {pruned} of them pruned. Best: depth {winner.params['depth']}, "
+          f"temperature {winner.params['temperature']:g}, mean return {winner.value:,.1f} on the episodes it was "
+          "chosen by.")  # fmt: skip
+    print(f"On {args.report_episodes} other episodes:")
+    for one in played:
+        mean = one["mean_return"]
+        interval = "" if mean["low"] is None else f"   95 % interval [{mean['low']:,.1f}, {mean['high']:,.1f}]"
+        print(f"  {one['label']:8} {mean['value']:12,.1f}{interval}")
+    try:
+        plots = save_plots(search, folder)
+    except ImportError:
+        plots = []
+        print('No plots: they need matplotlib, pip install "sb3_said[plots]"')
+    for note in notes:
+        print(note)
+    names = ["results.json", "best.yml", "best.zip", *(path.name for path in plots)]
+    print(f"Wrote {', '.join(names)} in {folder}\nTrain with it: {train_command(args, folder)}")
+
+
+def trial_to_dict(trial: FrozenTrial, seed: int) -> dict[str, Any]:
+    """Return what results.json keeps of a trial."""
+    returns = returns_of(trial)
+    interval = bootstrap_interval(returns)
+    return {
+        "number": trial.number,
+        "state": trial.state.name,
+        **trial.params,
+        "mean_return": interval.value,
+        "interval": None if len(returns) < 2 else [interval.low, interval.high],
+        "seed": seed,
+        "n_episodes": len(returns),
+        "returns": returns,
+        "seconds": None if trial.duration is None else trial.duration.total_seconds(),
+    }
+
+
+def write_configs(args: argparse.Namespace, search: Search, winner: FrozenTrial, folder: Path) -> list[str]:
+    """Write best.yml for train.py, and beside best.zip the YAML that evaluate.py reads.
+
+    :return: what the reader has to know, a line each
+    """
+    params = next(args.run.glob("*/args.yml")).parent
+    hyperparams, zoo_args = _read_params(params)
+    planner = {"depth": winner.params["depth"], "temperature": winner.params["temperature"]}
+    block, left_out = best_block(hyperparams, zoo_args, planner)
+    env_id = str(getattr(zoo_args["env"], "gym_id", zoo_args["env"]))
+    document = {env_id: block, "presets": {name: {"default": {}} for name in PRESETS if name != "cpu"}}
+    notes = [f"Left out of best.yml, as YAML cannot hold it: {name}" for name in left_out]
+    lines = [
+        f"Winner of study {search.name!r}: trial {winner.number} of {len(search.finished())}, mean return "
+        f"{winner.value:.1f} over {search.episodes} episodes; see results.json.",
+        train_command(args, folder),
+        *notes,
+        "The block is whole: presets change nothing in it.",
+    ]
+    text = "".join(f"# {line}\n" for line in lines) + yaml.safe_dump(document, sort_keys=False)
+    write_text(folder / "best.yml", text)
+
+    target = folder / params.name
+    shutil.copytree(params, target, dirs_exist_ok=True)
+    config = yaml.load((params / "config.yml").read_text(), Loader=yaml.UnsafeLoader)
+    config["planner_kwargs"] = {**(config.get("planner_kwargs") or {}), **planner}
+    write_text(target / "config.yml", yaml.dump(config))
+    return notes
+
+
+def best_block(
+    hyperparams: dict[str, Any], zoo_args: dict[str, Any], planner: dict[str, Any]
+) -> tuple[dict[str, Any], list[str]]:
+    """Return a run's hyper-parameters with the tuned planner, as rl_zoo3 reads them from YAML.
+
+    The wrapper of the delay is left out, since ``--delay`` adds it.
+
+    :param hyperparams: of the run's config.yml
+    :param zoo_args: of its args.yml; what the command line set beside the hyper-parameters goes into the block
+    :param planner: depth and temperature
+    :return: the block, and the names of hyper-parameters that YAML cannot hold
+    """
+    block, left_out = {}, []
+    for name, value in hyperparams.items():
+        if name == "normalize_kwargs" or (name == "normalize" and not value):  # added by reading, not by the user
+            continue
+        if name == "env_wrapper":
+            wrappers = value if isinstance(value, list) else [value]
+            value = [w for w in wrappers if w and (next(iter(w)) if isinstance(w, dict) else w) != WRAPPER]
+            if not value:
+                continue
+        try:
+            block[name] = plain(value)
+        except TypeError:
+            left_out.append(name)
+    block["planner_kwargs"] = {**(block.get("planner_kwargs") or {}), **planner}
+    if zoo_args.get("n_timesteps", -1) > 0:
+        block["n_timesteps"] = zoo_args["n_timesteps"]
+    if zoo_args.get("env_kwargs"):
+        block["env_kwargs"] = plain(zoo_args["env_kwargs"])
+    return block, left_out
+
+
+def plain(value: Any) -> Any:
+    """Return a value as dicts, lists, numbers and strings.
+
+    :raises TypeError: when it is more than that
+    """
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    raise TypeError(f"{value!r} is not plain")
+
+
+def train_command(args: argparse.Namespace, folder: Path) -> str:
+    """Return the command that trains anew with the winner."""
+    params = next(args.run.glob("*/args.yml")).parent
+    hyperparams, zoo_args = _read_params(params)
+    delay: Any = None
+    for wrapper in hyperparams.get("env_wrapper") or []:
+        if isinstance(wrapper, dict) and WRAPPER in wrapper:
+            delay = wrapper[WRAPPER].get("delay")
+    delays = [] if delay is None else [str(d) for d in (delay if isinstance(delay, (list, tuple)) else [delay])]
+    words = ["python", "scripts/train.py", "--algo", "said", "--env", str(zoo_args["env"])]
+    words += ["--delay", *delays] if delays else []
+    return shlex.join([*words, "-conf", str(folder / "best.yml")])
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file whole or not at all."""
+    unfinished = path.with_name(f"{path.name}.{os.getpid()}")
+    unfinished.write_text(text)
+    unfinished.replace(path)
+
+
+if __name__ == "__main__":
+    main()
