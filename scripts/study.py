@@ -6,7 +6,7 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -96,17 +96,18 @@ class Search:
             return self.n_trials
         return math.inf if self.sampler == "grid" else len(self.depths) * len(self.temperatures)
 
-    def work(self, planners: DepthPlanners, play: Play, deadline: float | None = None) -> None:
-        """Make trials until there is none left to begin.
+    def work(self, planners: DepthPlanners, play: Play, deadline: float | None = None) -> int:
+        """Make trials until there is none left to begin, and return how many were made.
 
         :param planners: of the agent that plays
         :param play: plays episodes
         :param deadline: ``time.monotonic()`` after which none is begun
         """
+        made = 0
         while deadline is None or time.monotonic() < deadline:
             begun = self._begin(planners)
             if begun is None:
-                return
+                break
             trial, claim = begun
             depth, temperature = trial.params["depth"], trial.params["temperature"]
             try:
@@ -123,6 +124,8 @@ class Search:
                 f"{np.mean(returns):,.1f} over {len(returns)} episodes{pruned}",
                 flush=True,
             )
+            made += 1
+        return made
 
     def running(self) -> list[FrozenTrial]:
         """Return the trials that a living worker is at."""
@@ -216,7 +219,7 @@ class MainEffects(BaseImportanceEvaluator):
     :param levels: values of each parameter; others count as the nearest
     """
 
-    def __init__(self, levels: dict[str, Sequence[float]]):
+    def __init__(self, levels: Mapping[str, Sequence[float]]):
         self.levels = {name: np.array(sorted(values)) for name, values in levels.items()}
 
     def evaluate(
@@ -272,7 +275,7 @@ def save_plots(search: Search, folder: Path) -> list[Path]:
     ):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            axes = np.ravel(drawing())
+            axes = np.ravel(np.asarray(drawing()))
         axes[0].figure.savefig(path, dpi=150, bbox_inches="tight")
         matplotlib.pyplot.close(axes[0].figure)
     return paths

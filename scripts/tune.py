@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import shlex
-import shutil
 import time
 from argparse import Namespace
 from importlib.util import find_spec
@@ -14,12 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import torch as th
-import yaml
 from evaluate import evaluate, origin
 from optuna.trial import FrozenTrial
-from runs import LoadedRun, _read_params, load_run
+from runs import LoadedRun, load_run
 from study import Search, returns_of, save_plots
-from zoo import PRESETS, WRAPPER
+from winner import RunConfig, write_text
 
 from sb3_said import SAID
 from sb3_said.common.checkpoint import CHECKPOINT_NAME
@@ -176,7 +172,9 @@ def tune(args: argparse.Namespace) -> None:
         played = rollout(model, run.make_env, n, seed, n, deterministic=True, normalize=run.normalize)
         return [float(value) for value in played.returns]
 
-    search.work(planners, play, None if args.timeout is None else time.monotonic() + args.timeout)
+    made = search.work(planners, play, None if args.timeout is None else time.monotonic() + args.timeout)
+    if made == 0 and args.timeout is None:
+        print("No trial is left to make.")
 
     others = search.running()
     if others:
@@ -225,8 +223,8 @@ def report(
     planners.put(winner.params["depth"], winner.params["temperature"])
     fresh = {
         "study": search.name,
-        "storage": search.storage,
         "trial": winner.number,
+        "finished": str(winner.datetime_complete),
         "seed": args.report_seed,
         "n_episodes": args.report_episodes,
     }
@@ -241,7 +239,12 @@ def report(
         played = [evaluate(run, answer, how).to_dict() for answer in ("planner", "expert")]
     assert isinstance(run.model, SAID)
     run.model.save(folder / "best.zip")
-    notes = write_configs(args, search, winner, folder)
+    config = RunConfig.read(args.run)
+    choice = (
+        f"trial {winner.number} of {len(search.finished())} in study {search.name!r}, mean return "
+        f"{winner.value:.1f} over {search.episodes} episodes"
+    )
+    left_out = config.write_best(folder, dict(winner.params), choice)
 
     trials = [trial_to_dict(trial, args.seed) for trial in search.finished()]
     document = {
@@ -268,10 +271,10 @@ def report(
     except ImportError:
         plots = []
         print('No plots: they need matplotlib, pip install "sb3_said[plots]"')
-    for note in notes:
-        print(note)
+    for name in left_out:
+        print(f"Left out of best.yml, as YAML cannot hold it: {name}")
     names = ["results.json", "best.yml", "best.zip", *(path.name for path in plots)]
-    print(f"Wrote {', '.join(names)} in {folder}\nTrain with it: {train_command(args, folder)}")
+    print(f"Wrote {', '.join(names)} in {folder}\nTrain with it: {config.train_command(folder)}")
 
 
 def trial_to_dict(trial: FrozenTrial, seed: int) -> dict[str, Any]:
@@ -289,104 +292,6 @@ def trial_to_dict(trial: FrozenTrial, seed: int) -> dict[str, Any]:
         "returns": returns,
         "seconds": None if trial.duration is None else trial.duration.total_seconds(),
     }
-
-
-def write_configs(args: argparse.Namespace, search: Search, winner: FrozenTrial, folder: Path) -> list[str]:
-    """Write best.yml for train.py, and beside best.zip the YAML that evaluate.py reads.
-
-    :return: what the reader has to know, a line each
-    """
-    params = next(args.run.glob("*/args.yml")).parent
-    hyperparams, zoo_args = _read_params(params)
-    planner = {"depth": winner.params["depth"], "temperature": winner.params["temperature"]}
-    block, left_out = best_block(hyperparams, zoo_args, planner)
-    env_id = str(getattr(zoo_args["env"], "gym_id", zoo_args["env"]))
-    document = {env_id: block, "presets": {name: {"default": {}} for name in PRESETS if name != "cpu"}}
-    notes = [f"Left out of best.yml, as YAML cannot hold it: {name}" for name in left_out]
-    lines = [
-        f"Winner of study {search.name!r}: trial {winner.number} of {len(search.finished())}, mean return "
-        f"{winner.value:.1f} over {search.episodes} episodes; see results.json.",
-        train_command(args, folder),
-        *notes,
-        "The block is whole: presets change nothing in it.",
-    ]
-    text = "".join(f"# {line}\n" for line in lines) + yaml.safe_dump(document, sort_keys=False)
-    write_text(folder / "best.yml", text)
-
-    target = folder / params.name
-    shutil.copytree(params, target, dirs_exist_ok=True)
-    config = yaml.load((params / "config.yml").read_text(), Loader=yaml.UnsafeLoader)
-    config["planner_kwargs"] = {**(config.get("planner_kwargs") or {}), **planner}
-    write_text(target / "config.yml", yaml.dump(config))
-    return notes
-
-
-def best_block(
-    hyperparams: dict[str, Any], zoo_args: dict[str, Any], planner: dict[str, Any]
-) -> tuple[dict[str, Any], list[str]]:
-    """Return a run's hyper-parameters with the tuned planner, as rl_zoo3 reads them from YAML.
-
-    The wrapper of the delay is left out, since ``--delay`` adds it.
-
-    :param hyperparams: of the run's config.yml
-    :param zoo_args: of its args.yml; what the command line set beside the hyper-parameters goes into the block
-    :param planner: depth and temperature
-    :return: the block, and the names of hyper-parameters that YAML cannot hold
-    """
-    block, left_out = {}, []
-    for name, value in hyperparams.items():
-        if name == "normalize_kwargs" or (name == "normalize" and not value):  # added by reading, not by the user
-            continue
-        if name == "env_wrapper":
-            wrappers = value if isinstance(value, list) else [value]
-            value = [w for w in wrappers if w and (next(iter(w)) if isinstance(w, dict) else w) != WRAPPER]
-            if not value:
-                continue
-        try:
-            block[name] = plain(value)
-        except TypeError:
-            left_out.append(name)
-    block["planner_kwargs"] = {**(block.get("planner_kwargs") or {}), **planner}
-    if zoo_args.get("n_timesteps", -1) > 0:
-        block["n_timesteps"] = zoo_args["n_timesteps"]
-    if zoo_args.get("env_kwargs"):
-        block["env_kwargs"] = plain(zoo_args["env_kwargs"])
-    return block, left_out
-
-
-def plain(value: Any) -> Any:
-    """Return a value as dicts, lists, numbers and strings.
-
-    :raises TypeError: when it is more than that
-    """
-    if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    if value is None or isinstance(value, (bool, int, float, str)):
-        return value
-    raise TypeError(f"{value!r} is not plain")
-
-
-def train_command(args: argparse.Namespace, folder: Path) -> str:
-    """Return the command that trains anew with the winner."""
-    params = next(args.run.glob("*/args.yml")).parent
-    hyperparams, zoo_args = _read_params(params)
-    delay: Any = None
-    for wrapper in hyperparams.get("env_wrapper") or []:
-        if isinstance(wrapper, dict) and WRAPPER in wrapper:
-            delay = wrapper[WRAPPER].get("delay")
-    delays = [] if delay is None else [str(d) for d in (delay if isinstance(delay, (list, tuple)) else [delay])]
-    words = ["python", "scripts/train.py", "--algo", "said", "--env", str(zoo_args["env"])]
-    words += ["--delay", *delays] if delays else []
-    return shlex.join([*words, "-conf", str(folder / "best.yml")])
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file whole or not at all."""
-    unfinished = path.with_name(f"{path.name}.{os.getpid()}")
-    unfinished.write_text(text)
-    unfinished.replace(path)
 
 
 if __name__ == "__main__":

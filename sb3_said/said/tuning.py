@@ -96,7 +96,7 @@ class Claim:
         return None if is_dead or silent > self.stale_after else f"process {holder['pid']} on {holder['host']}"
 
     def _remove_stale(self, content: str) -> None:
-        # Renamed first: of several processes that find it stale only one gets it, and sees whether it is still the same.
+        # Renamed first: of several processes that find it stale one gets it, and sees whether it is still the same.
         aside = self.path.with_name(f"{self.path.name}.{uuid.uuid4().hex}")
         try:
             self.path.rename(aside)
@@ -188,7 +188,7 @@ class DepthPlanners:
         return {
             "gradient_steps": self.gradient_steps,
             "newest_fraction": model.planner_newest_fraction,
-            "seed": model.seed or 0,
+            "training_seed": model.seed or 0,
             "trained_steps": model.num_timesteps,
             "config": json.loads(json.dumps(config)),
         }

@@ -1,0 +1,381 @@
+"""tune.py: trains each depth once, resumes, shares its work between workers, prunes, and reports on fresh episodes."""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from argparse import Namespace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+
+pytest.importorskip("rl_zoo3")
+pytest.importorskip("scipy")
+
+import optuna
+import train
+import tune
+import yaml
+from optuna.trial import TrialState
+from runs import load_run
+from study import MainEffects, Search, returns_of
+from winner import RunConfig
+from zoo import DelayedExperimentManager, Run
+
+from sb3_said import SAID
+from sb3_said.common.checkpoint import CHECKPOINT_NAME
+from sb3_said.evaluation import rollout
+from sb3_said.said import tuning
+from sb3_said.said.tuning import Claim, DepthPlanners
+
+ENV = "InvertedPendulum-v5"
+STEPS = 3
+PLANNER = "dict(depth=1, d_model=32, horizon=4, sampling_steps=1, n_candidates=2, batch_size=8)"
+SCRIPT = Path(tune.__file__)
+QUICK = ["--episodes", "4", "--round", "2", "--report-episodes", "3", "--device", "cpu", "--num-threads", "1"]
+
+
+def train_run(folder: Path, algo: str, *params: str) -> Path:
+    train.main(
+        ["--algo", algo, "--env", ENV, "--delay", "2", "--preset", "cpu", "-f", str(folder), "--seed", "3",
+         "--num-threads", "1", "--eval-freq", "-1", "--device", "cpu", "--verbose", "0", "-n", "200",
+         "-params", "learning_starts:100", "buffer_size:400", *params]
+    )  # fmt: skip
+    return folder / algo / f"{ENV}-delay2_1"
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("logs")
+    return train_run(folder, "said", f"planner_gradient_steps:{STEPS}", f"planner_kwargs:{PLANNER}")
+
+
+@pytest.fixture
+def run(trained: Path, tmp_path: Path) -> Path:
+    """A run of its own, since tuning writes into it."""
+    return Path(shutil.copytree(trained, tmp_path / "run"))
+
+
+@pytest.fixture
+def trainings(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The depths that were trained, in order."""
+    depths: list[int] = []
+    train_planner = DepthPlanners._train
+
+    def counted(self: DepthPlanners, depth: int) -> None:
+        depths.append(depth)
+        train_planner(self, depth)
+
+    monkeypatch.setattr(DepthPlanners, "_train", counted)
+    return depths
+
+
+def forbidden(*_: Any, **__: Any) -> Any:
+    raise AssertionError("this was done already")
+
+
+def test_a_search_from_grid_to_report(
+    run: Path, trainings: list[int], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("matplotlib")
+    command = ["--run", str(run), "--depths", "1", "2", "--temperatures", "0", "1", *QUICK]
+    seeds: list[int] = []
+
+    def recorded(model: Any, env: Any, n: int, seed: int, *args: Any, **kwargs: Any) -> Any:
+        seeds.extend(range(seed, seed + n))
+        return rollout(model, env, n, seed, *args, **kwargs)
+
+    monkeypatch.setattr(tune, "rollout", recorded)
+    tune.main(command)
+    results = json.loads((run / "tune" / "results.json").read_text())
+    cells = {(trial["depth"], trial["temperature"]) for trial in results["trials"]}
+    assert len(results["trials"]) == 4 and cells == {(1, 0.0), (1, 1.0), (2, 0.0), (2, 1.0)}
+    assert trainings == [2]  # once for two temperatures, and never the depth that the run itself has
+    assert (run / "tune" / "importance.png").is_file() and (run / "tune" / "slice.png").is_file()
+
+    # The report is on other episodes, and evaluate.py gets the same numbers from best.zip.
+    report = results["report"]
+    assert set(seeds) == set(range(20_000, 20_004))
+    assert not set(seeds) & set(range(report["seed"], report["seed"] + report["n_episodes"]))
+    best = load_run(run / "tune" / "best.zip", device="cpu")
+    assert best.info["delay"] == 2 and isinstance(best.model, SAID)
+    winner = results["winner"]
+    config = best.model.policy.planner.config
+    assert (config.depth, config.temperature) == (winner["depth"], winner["temperature"])
+    for one in report["results"]:
+        with best.model.policy.answering(one["label"]):
+            played = rollout(best.model, best.make_env, 3, report["seed"], n_envs=8)
+        assert one["returns"] == played.returns.tolist()
+    assert [one["label"] for one in report["results"]] == ["planner", "expert"]
+
+    # The same command again makes nothing twice, and still says what was found.
+    monkeypatch.setattr(tune, "rollout", forbidden)
+    monkeypatch.setattr(tune, "evaluate", forbidden)
+    capsys.readouterr()
+    tune.main(command)
+    out = capsys.readouterr().out
+    assert "No trial is left" in out and "4 trials" in out and trainings == [2]
+    assert json.loads((run / "tune" / "results.json").read_text())["report"] == report
+
+    # A grid that grew makes only what is new.
+    monkeypatch.setattr(tune, "rollout", rollout)
+    tune.main([*command[:6], "0", "1", "0.5", *QUICK, "--n-trials", "5"] if False else
+              ["--run", str(run), "--depths", "1", "--temperatures", "0", "0.5", "1", *QUICK])  # fmt: skip
+    trials = json.loads((run / "tune" / "results.json").read_text())["trials"]
+    assert [(t["depth"], t["temperature"]) for t in trials[4:]] == [(1, 0.5)]
+
+
+def test_train_reads_the_winner(run: Path, tmp_path: Path) -> None:
+    (run / "tune").mkdir()
+    config = RunConfig.read(run)
+    assert config.write_best(run / "tune", {"depth": 2, "temperature": 0.3}, "for a test") == []
+    best = run / "tune" / "best.yml"
+    for preset in ("cpu", "paper"):  # "paper" is the default on a machine with a GPU
+        manager = DelayedExperimentManager(
+            Run([], [2], preset, 25_000), Namespace(), "said", ENV, str(tmp_path), config=str(best), verbose=0
+        )
+        found, _ = manager.read_hyperparameters()
+        before = yaml.load((run / ENV / "config.yml").read_text(), Loader=yaml.UnsafeLoader)
+        before["planner_kwargs"] |= {"depth": 2, "temperature": 0.3}
+        assert found == {**before, "n_timesteps": 200}
+    assert config.train_command(run / "tune").endswith(f"--env {ENV} --delay 2 -conf {best}")
+    train.main(["--algo", "said", "--env", ENV, "--delay", "2", "-conf", str(best), "-f", str(tmp_path), "-n", "120",
+                "--num-threads", "1", "--eval-freq", "-1", "--device", "cpu", "--verbose", "0"])  # fmt: skip
+    model = load_run(tmp_path / "said" / f"{ENV}-delay2_1", device="cpu").model
+    assert isinstance(model, SAID) and model.policy.planner.config.temperature == 0.3
+    assert len(model.policy.planner.network.blocks) == 2
+
+
+def test_what_yaml_cannot_hold_is_named() -> None:
+    config = RunConfig(Path(), {"policy_kwargs": {"activation_fn": th.nn.Tanh}, "gamma": 0.9}, {})
+    block, left_out = config.block({"depth": 2, "temperature": 0.0})
+    assert block == {"gamma": 0.9, "planner_kwargs": {"depth": 2, "temperature": 0.0}}
+    assert left_out == ["policy_kwargs"]
+
+
+def test_two_workers_share_a_study_and_train_no_depth_twice(run: Path) -> None:
+    command = [sys.executable, str(SCRIPT), "--run", str(run), "--depths", "2", "3", "--temperatures", "0", "1", *QUICK]
+    environ = {**os.environ, "OMP_NUM_THREADS": "1"}
+    workers = [
+        subprocess.Popen(command, env=environ, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        for _ in range(2)
+    ]
+    outputs = [worker.communicate(timeout=120)[0] for worker in workers]
+    assert [worker.returncode for worker in workers] == [0, 0], outputs
+    assert sum(out.count("Training the planner of depth 2") for out in outputs) == 1, outputs
+    assert sum(out.count("Training the planner of depth 3") for out in outputs) == 1, outputs
+    trials = json.loads((run / "tune" / "results.json").read_text())["trials"]
+    assert len(trials) == 4 and len({(t["depth"], t["temperature"]) for t in trials}) == 4
+    assert not list((run / "tune" / "locks").iterdir())
+
+
+def make_planners(run: Path, folder: Path, steps: int) -> DepthPlanners:
+    model = load_run(run, device="cpu").model
+    assert isinstance(model, SAID)
+    return DepthPlanners(model, run / CHECKPOINT_NAME, folder, steps)
+
+
+def test_a_killed_training_goes_on_bit_for_bit(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = make_planners(run, tmp_path / "whole", 6)
+    whole.put(2, 0.5)
+    callback = functools.partial(tuning.PlannerTrainingCallback, save_interval=2)
+    monkeypatch.setattr(tuning, "PlannerTrainingCallback", callback)
+    halved = make_planners(run, tmp_path / "halved", 6)
+    step, calls = tuning.SAID.make_planner_trainer, []
+
+    def stopping(self: SAID, gradient_steps: int | None = None) -> Any:
+        trainer = step(self, gradient_steps)
+        original = trainer.step
+
+        def one_step() -> None:
+            if len(calls) == 3:
+                raise KeyboardInterrupt
+            calls.append(trainer.n_updates)
+            original()
+
+        monkeypatch.setattr(trainer, "step", one_step)
+        return trainer
+
+    monkeypatch.setattr(SAID, "make_planner_trainer", stopping)
+    with pytest.raises(KeyboardInterrupt):
+        halved.put(2, 0.5)
+    assert not halved.is_ready(2) and halved.claim(2).holder() is None
+    monkeypatch.setattr(SAID, "make_planner_trainer", step)
+    again = make_planners(run, tmp_path / "halved", 6)
+    again.put(2, 0.5)
+    for left, right in zip(
+        whole.model.policy.planner.parameters(), again.model.policy.planner.parameters(), strict=True
+    ):
+        th.testing.assert_close(left, right, rtol=0, atol=0)
+    # The expert is the run's, whatever the planner.
+    expert = load_run(run, device="cpu").model.policy.actor.state_dict()
+    for name, value in again.model.policy.actor.state_dict().items():
+        th.testing.assert_close(value, expert[name], rtol=0, atol=0)
+
+
+def test_planners_of_another_training_are_refused(run: Path, tmp_path: Path) -> None:
+    make_planners(run, tmp_path, 2).put(2, 0.5)
+    with pytest.raises(ValueError, match="gradient_steps was 2 and is now 4.*delete the file"):
+        make_planners(run, tmp_path, 4).put(2, 0.5)
+
+
+def test_a_claim_has_one_holder_and_outlives_no_process(tmp_path: Path) -> None:
+    first, second = Claim(tmp_path / "work.lock"), Claim(tmp_path / "work.lock")
+    assert first.try_acquire() and not second.try_acquire()
+    assert second.holder() == f"process {os.getpid()} on {json.loads(first._content)['host']}"
+    second.release()  # not its own: nothing happens
+    assert first.holder() is not None
+    first.release()
+    assert second.try_acquire()
+    second.release()
+
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    content = json.loads(first._content)
+    first.path.write_text(json.dumps({**content, "pid": ended.pid}))  # its process died here
+    assert second.holder() is None and second.try_acquire()
+    second.release()
+    first.path.write_text(json.dumps({**content, "host": "elsewhere"}))
+    assert not second.try_acquire()
+    long_ago = time.time() - 1_000
+    os.utime(first.path, (long_ago, long_ago))  # its process died elsewhere
+    assert second.try_acquire()
+    # Who still believes in the stale one takes nothing from its new holder.
+    first._remove_stale(json.dumps({**content, "host": "elsewhere"}))
+    assert second.holder() is not None
+    second.release()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_held_claim_is_touched(tmp_path: Path) -> None:
+    claim = Claim(tmp_path / "work.lock", stale_after=0.4)
+    with claim:
+        time.sleep(1.0)
+        other = json.loads(claim._content) | {"host": "elsewhere"}
+        claim._content = json.dumps(other)  # as a process on another host sees it: only the touches count
+        assert claim.holder() is not None
+        claim._content = json.dumps({**other, "host": json.loads(claim.path.read_text())["host"]})
+    assert not claim.path.exists()
+
+
+class FreePlanners:
+    """Planners that need no training; remembers which is in use."""
+
+    def __init__(self, ready: bool = True) -> None:
+        self.cell = (0, 0.0)
+        self.ready = ready
+
+    def is_ready(self, depth: int) -> bool:
+        return self.ready
+
+    def put(self, depth: int, temperature: float) -> None:
+        self.cell = (depth, temperature)
+
+
+def make_search(folder: Path, temperatures: list[float], **options: Any) -> Search:
+    return Search(folder, str(folder / "study.log"), "test", [2], temperatures, **options)
+
+
+def test_a_hopeless_trial_is_pruned_and_a_close_one_is_not(tmp_path: Path) -> None:
+    planners = FreePlanners()
+    strength = {0.0: 100.0, 0.5: 0.0, 1.0: 99.0}
+
+    def play(seed: int, n: int) -> list[float]:
+        noise = [np.random.default_rng((s, int(10 * planners.cell[1]))).normal(0, 20) for s in range(seed, seed + n)]
+        return [strength[planners.cell[1]] + x for x in noise]
+
+    search = make_search(tmp_path, [0.0, 0.5, 1.0], episodes=20, round_size=5)
+    assert search.work(planners, play) == 3  # type: ignore[arg-type]
+    states = {trial.params["temperature"]: trial for trial in search.finished()}
+    assert states[0.5].state == TrialState.PRUNED and len(returns_of(states[0.5])) == 5
+    assert states[0.0].state == states[1.0].state == TrialState.COMPLETE
+    winner = search.winner()
+    assert winner is not None and winner.params["temperature"] != 0.5 and len(returns_of(winner)) == 20
+
+
+def test_the_cell_of_a_dead_worker_is_tried_again(tmp_path: Path) -> None:
+    search = make_search(tmp_path, [0.0, 1.0], episodes=2)
+    begun = search._begin(FreePlanners())  # type: ignore[arg-type]
+    assert begun is not None
+    other = make_search(tmp_path, [0.0, 1.0], episodes=2)
+    assert other.work(FreePlanners(), lambda seed, n: [1.0] * n) == 1  # type: ignore[arg-type]
+    assert len(other.running()) == 1  # that worker is alive: its cell is left to it
+    begun[1].release()
+    assert other.running() == []
+    assert other.work(FreePlanners(), lambda seed, n: [1.0] * n) == 1  # type: ignore[arg-type]
+    assert sorted(trial.params["temperature"] for trial in other.finished()) == [0.0, 1.0]
+    winner = other.winner()
+    assert winner is not None and winner.params["temperature"] == 0.0  # of equals, the coldest
+
+
+@pytest.mark.parametrize("storage", ["study.log", "sqlite:///{}/study.db"])
+def test_tpe_tries_as_many_as_it_is_told(tmp_path: Path, storage: str) -> None:
+    planners = FreePlanners()
+    options: dict[str, Any] = {"sampler": "tpe", "n_trials": 9, "episodes": 2, "prune": 0.0}
+    place = storage.format(tmp_path) if "://" in storage else str(tmp_path / storage)
+    for expected in (9, 0):
+        search = Search(tmp_path, place, "test", [2, 4], [0.0, 1.0], **options)
+        assert search.work(planners, lambda s, n: [-abs(planners.cell[1] - 0.5)] * n) == expected  # type: ignore[arg-type]
+    assert {trial.params["depth"] for trial in search.finished()} == {2, 4}
+    assert all(0.0 <= trial.params["temperature"] <= 1.0 for trial in search.finished())
+
+
+def test_importance_is_the_explained_variance() -> None:
+    study = optuna.create_study(direction="maximize")
+    distributions = {
+        "depth": optuna.distributions.IntDistribution(2, 8),
+        "temperature": optuna.distributions.FloatDistribution(0.0, 1.0),
+    }
+    for depth in (2, 4, 8):
+        for temperature in (0.0, 0.52, 1.0):
+            params = {"depth": depth, "temperature": temperature}
+            value = 10.0 * depth
+            study.add_trial(optuna.trial.create_trial(value=value, params=params, distributions=distributions))
+    evaluator = MainEffects({"depth": [2, 4, 8], "temperature": [0.0, 0.5, 1.0]})
+    found = optuna.importance.get_param_importances(study, evaluator=evaluator)
+    assert found == pytest.approx({"depth": 1.0, "temperature": 0.0})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--seed", "10049"], "Tuning would play the reset seeds 10049..10068"),
+        (["--episodes", "0"], "--episodes must be at least 1, got 0"),
+        (["--prune", "1.5"], "--prune is a p-value"),
+        (["--depths", "2", "2"], "--depths names a value twice: 2 2"),
+        (["--temperatures", "-1"], "temperature is -1"),
+        (["--depths", "0"], "depth is 0"),
+    ],
+)
+def test_says_what_is_wrong(run: Path, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_info:
+        tune.main(["--run", str(run), *arguments])
+    assert exit_info.value.code == 2 and message in capsys.readouterr().err
+
+
+def test_folders_that_cannot_be_tuned(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for folder, message in (
+        (tmp_path / "nowhere", "does not exist"),
+        (train_run(tmp_path, "sadr"), "is a run of 'sadr', which has no planner"),
+    ):
+        with pytest.raises(SystemExit):
+            tune.main(["--run", str(folder), "--device", "cpu"])
+        assert message in capsys.readouterr().err
+    (run / CHECKPOINT_NAME).unlink()
+    with pytest.raises(SystemExit):
+        tune.main(["--run", str(run), "--device", "cpu"])
+    assert "has no checkpoint.zip" in capsys.readouterr().err
+
+
+def test_a_study_begun_otherwise_is_refused(tmp_path: Path) -> None:
+    make_search(tmp_path, [0.0], episodes=2)
+    with pytest.raises(ValueError, match="episodes was 2 and is now 3.*--study-name"):
+        make_search(tmp_path, [0.0], episodes=3)
