@@ -21,7 +21,6 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 
 from sb3_said.said.tuning import Claim, DepthPlanners
 
-warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
 optuna.logging.set_verbosity(optuna.logging.WARNING)
 
 #: Returns (n,) of the agent, in n episodes from a reset seed on.
@@ -68,7 +67,11 @@ class Search:
         common = {**self.settings, "sampler": self.sampler, "episodes": self.episodes, "seed": self.seed}
         if self.sampler == "tpe":
             common |= {"depths": self.depths, "temperatures": [min(self.temperatures), max(self.temperatures)]}
-        pruner = optuna.pruners.WilcoxonPruner(p_threshold=self.prune) if self.prune > 0 else optuna.pruners.NopPruner()
+        pruner: optuna.pruners.BasePruner = optuna.pruners.NopPruner()
+        if self.prune > 0:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+                pruner = optuna.pruners.WilcoxonPruner(p_threshold=self.prune)
         with self._lock():
             self.study = optuna.create_study(
                 storage=open_storage(self.storage),
@@ -144,8 +147,10 @@ class Search:
     def _begin(self, planners: DepthPlanners) -> tuple[Trial, Claim] | None:
         with self._lock():
             for trial in self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
-                if self._claim(trial).holder() is None:
-                    self.study.tell(trial.number, state=TrialState.FAIL)  # its worker died; the cell is free again
+                claim = self._claim(trial)
+                if claim.try_acquire():  # its worker died: the cell is free again
+                    self.study.tell(trial.number, state=TrialState.FAIL)
+                    claim.release()
             taken = [trial for trial in self.study.get_trials(deepcopy=False) if trial.state != TrialState.FAIL]
             waiting = [trial for trial in taken if trial.state == TrialState.WAITING]
             if not waiting and len(taken) >= self.limit:
@@ -270,7 +275,7 @@ def save_plots(search: Search, folder: Path) -> list[Path]:
     grid = {name: levels[name] if name == "depth" else search.temperatures for name in varied}
     paths = [folder / "importance.png", folder / "slice.png"]
     for path, drawing in (
-        (paths[0], lambda: draw.plot_param_importances(whole, MainEffects(grid), varied)),
+        (paths[0], lambda: draw.plot_param_importances(whole, MainEffects(grid), varied, target_name="mean return")),
         (paths[1], lambda: draw.plot_slice(whole, varied, target_name="mean return")),
     ):
         with warnings.catch_warnings():

@@ -59,12 +59,13 @@ def make_parser() -> argparse.ArgumentParser:
         description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--run", type=Path, required=True, metavar="RUN_DIR", help="folder that train.py left")
-    parser.add_argument("--depths", type=int, nargs="+", default=[2, 4, 8], help="default: 2 4 8")
+    parser.add_argument("--depths", type=int, nargs="+", default=[2, 4, 8], metavar="N", help="default: 2 4 8")
     parser.add_argument(
         "--temperatures",
         type=float,
         nargs="+",
         default=[0.0, 0.1, 0.3, 0.6, 0.8, 1.0],
+        metavar="T",
         help="default: 0 0.1 0.3 0.6 0.8 1",
     )
     parser.add_argument("--sampler", choices=("grid", "tpe"), default="grid", help="default: grid, every cell once")

@@ -18,6 +18,7 @@ from sb3_said.common.save_util import load_tree, save_tree
 
 CHECKPOINT_NAME = "checkpoint.zip"
 _COUNTERS = ("num_timesteps", "_episode_num", "_n_updates", "_total_timesteps", "_current_progress_remaining")
+_OPTIONAL_COUNTERS = ("_planner_trained_at",)  # SAID's
 
 
 class TrainingCheckpointCallback(BaseCallback):
@@ -70,7 +71,10 @@ def training_state(model: OffPolicyAlgorithm, callback: BaseCallback | None = No
     return {
         "parameters": model.get_parameters(),
         "variables": {name: getattr(model, name).detach() for name in variables},
-        "counters": {name: getattr(model, name) for name in _COUNTERS},
+        "counters": {
+            **{name: getattr(model, name) for name in _COUNTERS},
+            **{name: getattr(model, name) for name in _OPTIONAL_COUNTERS if hasattr(model, name)},
+        },
         "replay_buffer": model.replay_buffer.state_dict(),
         "vec_normalize": None if vec_normalize is None else _vec_normalize_state(vec_normalize),
         "evaluations": [_evaluation_state(e) for e in _eval_callbacks(callback)],
@@ -144,8 +148,9 @@ def _restore_vec_normalize(vec_normalize: VecNormalize, state: dict[str, Any]) -
 
 
 def _eval_callbacks(callback: BaseCallback | None) -> list[EvalCallback]:
-    callbacks = callback.callbacks if isinstance(callback, CallbackList) else [callback]
-    return [c for c in callbacks if isinstance(c, EvalCallback)]
+    if isinstance(callback, CallbackList):  # nested: SB3's progress bar puts the run's list into another
+        return [found for child in callback.callbacks for found in _eval_callbacks(child)]
+    return [callback] if isinstance(callback, EvalCallback) else []
 
 
 def _evaluation_state(callback: EvalCallback) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch as th
 from torch import nn
 
+from sb3_said.common.windows import Windows
 from sb3_said.planner.diffusion import check_choice
 
 ACTION_TRANSFORMS = ("standard", "tanh")
@@ -14,8 +15,14 @@ LARGEST_ACTION = 0.999  # the paper's bound before arctanh
 class Normalizer(nn.Module):
     """Z-score states and actions; its statistics are buffers, so they are saved with the planner.
 
+    With ``relative_states`` a window holds, behind its first state, how far each state has moved from there, in
+    standard deviations of such moves at that index. States a few steps apart differ by little, and errors count in
+    that little.
+
     :param obs_dim: numbers in a state
     :param act_dim: numbers in an action
+    :param window_length: L, steps of a window
+    :param relative_states: see above; False z-scores every state alike (paper)
     :param action_transform: ``"standard"``: z-score actions as they are, and clip them on the way back; ``"tanh"`` (the
         paper's): clip to 0.999, arctanh, z-score, and back through tanh
     :raises ValueError: for an unknown transform
@@ -25,9 +32,20 @@ class Normalizer(nn.Module):
     state_std: th.Tensor
     action_mean: th.Tensor
     action_std: th.Tensor
+    move_std: th.Tensor
 
-    def __init__(self, obs_dim: int, act_dim: int, action_transform: str = "standard") -> None:
+    def __init__(
+        self,
+        obs_dim: int,
+        act_dim: int,
+        window_length: int,
+        action_transform: str = "standard",
+        relative_states: bool = False,
+    ) -> None:
         super().__init__()
+        self.obs_dim, self.act_dim = obs_dim, act_dim
+        self.relative_states = relative_states
+        self.register_buffer("move_std", th.ones(window_length - 1, obs_dim))
         check_choice("action_transform", action_transform, ACTION_TRANSFORMS)
         self.action_transform = action_transform
         for name, size in (("state", obs_dim), ("action", act_dim)):
@@ -48,6 +66,38 @@ class Normalizer(nn.Module):
             std[std <= 1e-6 * values.abs().amax(0)] = 1.0
             getattr(self, f"{name}_mean").copy_(mean)
             getattr(self, f"{name}_std").copy_(std)
+
+    @th.no_grad()
+    def fit_moves(self, windows: Windows) -> None:
+        """Take over how far states move within a window, index by index; after :meth:`fit`.
+
+        :param windows: (B, L, obs_dim), environment units
+        """
+        z = self.normalize_states(windows.states)
+        moves, valid = z[:, 1:] - z[:, :1], windows.valid[:, 1:, None]
+        std = (th.where(valid, moves**2, 0.0).sum(0) / valid.sum(0).clamp(min=1)).sqrt()  # (L - 1, obs_dim)
+        self.move_std.copy_(th.where(std > 1e-6, std, 1.0))
+
+    def normalize(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """Map windows to the planner's units.
+
+        :param states: (..., L, obs_dim), environment units
+        :param actions: (..., L, act_dim), in [-1, 1]
+        :return: (..., L, obs_dim + act_dim)
+        """
+        z = self.normalize_states(states)
+        if self.relative_states:
+            first = z[..., :1, :]
+            z = th.cat([first, (z[..., 1:, :] - first) / self.move_std], dim=-2)
+        return th.cat([z, self.normalize_actions(actions)], dim=-1)
+
+    def denormalize(self, x: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Invert :meth:`normalize`: states and actions, the latter in [-1, 1] whatever is given."""
+        z, actions = x.split([self.obs_dim, self.act_dim], dim=-1)
+        if self.relative_states:
+            first = z[..., :1, :]
+            z = th.cat([first, first + z[..., 1:, :] * self.move_std], dim=-2)
+        return self.denormalize_states(z), self.denormalize_actions(actions)
 
     def normalize_states(self, states: th.Tensor) -> th.Tensor:
         """Map (..., obs_dim) from environment units to standard deviations from the mean."""

@@ -63,7 +63,9 @@ class InpaintingPlanner(nn.Module):
             config.positions,
             config.embed_known,
         )
-        self.normalizer = Normalizer(obs_dim, act_dim, config.action_transform)
+        self.normalizer = Normalizer(
+            obs_dim, act_dim, self.window_length, config.action_transform, config.relative_states
+        )
 
     @property
     def device(self) -> th.device:
@@ -74,17 +76,21 @@ class InpaintingPlanner(nn.Module):
         """Return the context of ``config.precision`` here; :meth:`loss` and :meth:`plan` enter it themselves."""
         return autocast(self.config.precision, self.device)
 
-    def fit_normalizer(self, states: th.Tensor, actions: th.Tensor) -> None:
+    def fit_normalizer(self, states: th.Tensor, actions: th.Tensor, windows: Windows | None = None) -> None:
         """Set the mean and standard deviation that states and (transformed) actions are z-scored with.
 
         :param states: (M, obs_dim), environment units
         :param actions: (M, act_dim), in [-1, 1]
+        :param windows: of ``window_length`` steps, to scale the moves of ``config.relative_states`` by; left out, moves
+            keep the states' own scale
         :raises ValueError: for a wrong shape, no rows, or numbers that are not finite
         """
         states, actions = self._tensor(states), self._tensor(actions)
         _check("states", states, (None, self.obs_dim))
         _check("actions", actions, (len(states), self.act_dim))
         self.normalizer.fit(states, actions)
+        if windows is not None:
+            self.normalizer.fit_moves(Windows(*(part.to(self.device) for part in windows)))
 
     def loss(
         self,
@@ -94,6 +100,8 @@ class InpaintingPlanner(nn.Module):
         generator: th.Generator | None = None,
     ) -> th.Tensor:
         """Return the weighted mean squared error over unknown entries of valid steps (the paper's Algorithm 1).
+
+        The decision index counts ``config.decision_weight`` times as much as the others.
 
         :param windows: B windows of ``window_length`` steps, environment units
         :param delay: (B,) mask lengths; drawn as ``config.mask`` says by default
@@ -113,7 +121,7 @@ class InpaintingPlanner(nn.Module):
             delay = inpainting.draw_delays(n, self.max_delay, config.mask, config.mask_end_probability, generator)
         delay = self._delay(delay, n)
         valid = windows.valid.to(device)  # (B, L)
-        clean = self._normalize(states, actions)  # (B, L, obs_dim + act_dim)
+        clean = self.normalizer.normalize(states, actions)  # (B, L, obs_dim + act_dim)
         # Steps behind an episode's end repeat its last row: they are neither shown as known nor learned
         known = inpainting.known_mask(delay, self.window_length, self.obs_dim, self.act_dim) & valid[..., None]
         noise = self._noise(clean.shape, generator)
@@ -125,10 +133,12 @@ class InpaintingPlanner(nn.Module):
             output = network(x, network.context(clean, known), network.modulations(t), valid)
         target = diffusion.prediction_target(clean, noise, alpha, sigma, config.prediction)
         learned = valid[..., None] & ~known
-        error = th.where(learned, (output.float() - target) ** 2, 0.0)
+        decision = th.arange(self.window_length, device=device) == delay[:, None]  # (B, L)
+        share = th.where(decision[..., None], config.decision_weight, 1.0) * learned  # (B, L, obs_dim + act_dim)
+        error = th.where(learned, (output.float() - target) ** 2, 0.0) * share
         if weight is not None:
             error = error * weight[:, None, None]
-        return error.sum() / learned.sum().clamp(min=1)
+        return error.sum() / share.sum().clamp(min=1)
 
     @th.no_grad()
     def plan(
@@ -188,7 +198,7 @@ class InpaintingPlanner(nn.Module):
 
         given = inpainting.known_window(observation, action_history, delay, length)  # (B, L, obs_dim + act_dim)
         known = inpainting.known_mask(delay, length, self.obs_dim, self.act_dim)
-        clean, network = self._normalize(*self._split(given)), self.network
+        clean, network = self.normalizer.normalize(*self._split(given)), self.network
         if noise is None:
             noise = self._noise((n, n_candidates, *shape), generator)
         x = temperature * noise[..., :n_candidates, :, :].expand(n, -1, -1, -1)  # (B, N, L, obs_dim + act_dim)
@@ -203,9 +213,8 @@ class InpaintingPlanner(nn.Module):
                 impose=lambda x: th.where(known[:, None], clean[:, None], x),
             )
         # What is given comes back exactly as given, without the rounding of the normaliser
+        x = th.where(known[:, None], given[:, None], th.cat(self.normalizer.denormalize(x), dim=-1))
         states, actions = self._split(x)
-        states, actions = self.normalizer.denormalize_states(states), self.normalizer.denormalize_actions(actions)
-        states, actions = self._split(th.where(known[:, None], given[:, None], th.cat([states, actions], dim=-1)))
         values = self._values(states, actions, delay, value_fn)  # (B, N)
         rows = th.arange(n, device=self.device)
         return Plan(actions[rows, values.argmax(1), delay], states, actions, values)
@@ -231,9 +240,6 @@ class InpaintingPlanner(nn.Module):
     def _split(self, x: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         states, actions = x.split([self.obs_dim, self.act_dim], dim=-1)
         return states, actions
-
-    def _normalize(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        return th.cat([self.normalizer.normalize_states(states), self.normalizer.normalize_actions(actions)], dim=-1)
 
     def _noise(self, shape: tuple[int, ...], generator: th.Generator | None) -> th.Tensor:
         source = self.device if generator is None else generator.device

@@ -18,6 +18,7 @@ from sb3_said.planner.yardstick import Present, RegressionYardstick
 
 HELD_OUT_WINDOWS = 256  # per delay, in evaluate()
 YARDSTICK_LEARNING_RATE = 1e-3
+N_NORMALIZER_WINDOWS = 10_000  # enough for a standard deviation to a percent
 
 
 def learning_rate(step: int, gradient_steps: int, config: PlannerConfig) -> float:
@@ -98,7 +99,8 @@ class PlannerTrainer:
         )
 
         self.source, held_source = source.split(held_out, seed) if held_out > 0 else (source, None)
-        planner.fit_normalizer(self.source.start_states(), self.source.start_actions())
+        windows = self.source.sample(N_NORMALIZER_WINDOWS, planner.window_length, self.generator)
+        planner.fit_normalizer(self.source.start_states(), self.source.start_actions(), windows)
         self.online = copy.deepcopy(planner).train().requires_grad_(True)
         with th.random.fork_rng(devices=[]):  # the initial weights are the only draw that takes no generator
             th.manual_seed(seed)

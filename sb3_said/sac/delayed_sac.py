@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
+from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
@@ -36,7 +37,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
     :param augment_state: the actor reads [observation, action history, age]
     :param delay_reconciled_critic: the critics read the true state
     :param sac_kwargs: every other argument of :class:`stable_baselines3.SAC`
-    :raises ValueError: for spaces that are neither, or options that need another replay buffer (``n_steps`` > 1)
+    :raises ValueError: for spaces that are neither, a ``VecNormalize`` of more than the observation, or options that
+        need another replay buffer (``n_steps`` > 1) or policy
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -57,18 +59,46 @@ class DelayedSAC(SafeSaveMixin, SAC):
         **sac_kwargs: Any,
     ):
         if sac_kwargs.get("n_steps", 1) != 1:
-            raise ValueError(f"DelayedSAC learns from one-step targets, got n_steps={sac_kwargs['n_steps']}; leave it 1.")
+            raise ValueError(
+                f"DelayedSAC learns from one-step targets, got n_steps={sac_kwargs['n_steps']}; leave it 1."
+            )
         self.augment_state = augment_state
         self.delay_reconciled_critic = delay_reconciled_critic
+        if isinstance(policy, str):  # SB3 would refuse one of the two names, by the kind of space
+            policy = self.policy_aliases.get(policy, policy)  # type: ignore[assignment]
         super().__init__(policy, env, learning_rate, **sac_kwargs)
 
     def _setup_model(self) -> None:
-        if self.replay_buffer_class is None:
-            self.replay_buffer_class = DelayedReplayBuffer
+        self._check_parts()
         user_kwargs = self.policy_kwargs
         self.policy_kwargs = {**user_kwargs, **self._policy_flags()}
         super()._setup_model()
         self.policy_kwargs = user_kwargs
+
+    def _check_parts(self) -> None:
+        """:raises ValueError: for a policy, a replay buffer or a normalisation that does not go with delays"""
+        name, policy_class = type(self).__name__, self.policy_aliases["MlpPolicy"]
+        if not issubclass(self.policy_class, policy_class):
+            raise ValueError(
+                f"{name} needs a {policy_class.__name__}, got {self.policy_class.__name__}; "
+                "load a file with the class that saved it."
+            )
+        self.replay_buffer_class = self.replay_buffer_class or DelayedReplayBuffer
+        if not issubclass(self.replay_buffer_class, DelayedReplayBuffer):
+            raise ValueError(
+                f"{name} learns from a DelayedReplayBuffer, got {self.replay_buffer_class.__name__}; "
+                "leave replay_buffer_class out."
+            )
+        if twice := sorted(self._policy_flags().keys() & self.policy_kwargs.keys()):
+            raise ValueError(f"Give {', '.join(twice)} to {name} itself, not in policy_kwargs.")
+        vec_normalize = self.get_vec_normalize_env()
+        if isinstance(self.observation_space, spaces.Dict) and vec_normalize is not None and vec_normalize.norm_obs:
+            keys = vec_normalize.norm_obs_keys or []
+            if not set(keys) <= {"observation"}:
+                raise ValueError(
+                    f"VecNormalize must leave actions and ages as they are, but normalises {', '.join(sorted(keys))}; "
+                    "use VecNormalize(..., norm_obs_keys=['observation'])."
+                )
 
     def _policy_flags(self) -> dict[str, Any]:
         """Return what the policy's constructor needs of this algorithm's own arguments."""

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
-from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor, ContinuousCritic, SACPolicy
 
 from sb3_said.common.buffers import UNDELAYED, check_spaces
@@ -22,7 +24,7 @@ class DelayedSACPolicy(SACPolicy):
     :param delay_reconciled_critic: the critics read the true state, which only replay knows, instead of what the actor
         reads
     :param policy_kwargs: of ``SACPolicy``
-    :raises ValueError: for other spaces, or when a features extractor is given for a delayed task
+    :raises ValueError: for other spaces, or when a features extractor is given or shared in a delayed task
     """
 
     def __init__(
@@ -44,6 +46,11 @@ class DelayedSACPolicy(SACPolicy):
                 raise ValueError(
                     "What actor and critics read of a delayed observation is set by augment_state and "
                     "delay_reconciled_critic; leave features_extractor_class out."
+                )
+            if policy_kwargs.get("share_features_extractor", False):
+                raise ValueError(
+                    "Actor and critics read different things of a delayed observation; leave "
+                    "share_features_extractor=False."
                 )
             self.replay_space = spaces.Dict({**observation_space.spaces, UNDELAYED: state_space})
         super().__init__(observation_space, action_space, lr_schedule, **policy_kwargs)
@@ -70,9 +77,73 @@ class DelayedSACPolicy(SACPolicy):
             self.critic_kwargs["observation_space"] = self.replay_space
         return super().make_critic(features_extractor or self._critic_extractor())
 
+    def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
+        """Turn what ``predict`` was given into tensors, after checking it.
+
+        :param observation: one observation or a batch of them
+        :return: tensors with a batch dimension, and whether they had one before
+        :raises ValueError: for NaN or infinite entries, another shape, other keys, or an age outside 0..max_delay
+        """
+        space = self.observation_space
+        if not isinstance(space, spaces.Dict):
+            if isinstance(observation, dict):
+                raise ValueError(
+                    f"The agent was built for a task without delay, got a dict with the keys {sorted(observation)}; "
+                    "leave DelayedObservationWrapper out."
+                )
+            _check_array("observation", np.asarray(observation), space)
+            return super().obs_to_tensor(observation)
+        if not isinstance(observation, dict) or set(observation) != set(space.keys()):
+            given = f"the keys {sorted(observation)}" if isinstance(observation, dict) else type(observation).__name__
+            raise ValueError(
+                f"The agent was built for dict observations with the keys {sorted(space.keys())}, got {given}; "
+                "wrap the task in DelayedObservationWrapper."
+            )
+        arrays = {key: np.array(observation[key]) for key in space.keys()}
+        batches = {key: _check_array(key, values, space[key]) for key, values in arrays.items()}
+        if len(set(batches.values())) > 1:
+            raise ValueError(f"The parts of an observation differ in how many there are: {batches}.")
+        _check_delayed(arrays["delay"], arrays["action_history"], self.max_delay)
+        # SB3's own method cannot reshape an action history of no actions, that of max_delay 0.
+        is_batch = batches["delay"] is not None
+        tensors = {
+            key: th.as_tensor(values if is_batch else values[None], device=self.device)
+            for key, values in arrays.items()
+        }
+        return tensors, is_batch
+
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {
             **super()._get_constructor_parameters(),
             "augment_state": self.augment_state,
             "delay_reconciled_critic": self.delay_reconciled_critic,
         }
+
+
+def _check_array(name: str, values: np.ndarray, space: spaces.Space[Any]) -> int | None:
+    """Refuse an array of another shape, or one that is not finite. The bounds of the space are not looked at.
+
+    :return: size of the batch, None for a single element
+    """
+    if values.shape != space.shape and values.shape[1:] != space.shape:
+        raise ValueError(
+            f"{name} has the shape {values.shape}, expected {space.shape}, or (n_envs, *{space.shape}) for a batch; "
+            "the agent was built for another task or max_delay."
+        )
+    if not np.isfinite(values).all():
+        raise ValueError(f"{name} has entries that are NaN or infinite; find out where they come from first.")
+    return None if values.shape == space.shape else len(values)
+
+
+def _check_delayed(delay: np.ndarray, action_history: np.ndarray, max_delay: int) -> None:
+    """Refuse ages and actions that no ``DelayedObservationWrapper`` of this ``max_delay`` hands out."""
+    if np.any(delay != np.round(delay)) or np.any(delay < 0) or np.any(delay > max_delay):
+        raise ValueError(
+            f"delay runs from {delay.min():g} to {delay.max():g}, expected whole numbers in 0..{max_delay}: "
+            f"the agent was built for max_delay={max_delay}."
+        )
+    if np.any(np.abs(action_history) > 1.0 + 1e-4):
+        raise ValueError(
+            f"action_history has entries of size {np.abs(action_history).max():g}, expected actions scaled to [-1, 1], "
+            "as DelayedObservationWrapper gives them."
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -46,7 +47,10 @@ class PlannerTrainingCallback(BaseCallback):
         self.checkpoint = None if folder is None else Path(folder) / PLANNER_CHECKPOINT_NAME
         self.save_interval = save_interval
         self.progress_bar = progress_bar
-        self._trained_at = -1
+
+    def _on_training_start(self) -> None:
+        if self.model.num_timesteps < self.model._planner_trained_at:  # counting began anew
+            self.model._planner_trained_at = 0
 
     def _on_step(self) -> bool:
         return True
@@ -54,11 +58,13 @@ class PlannerTrainingCallback(BaseCallback):
     def _on_rollout_start(self) -> None:
         # Here, and not in on_step, the replay buffer holds every step taken.
         freq, now = self.model.planner_train_freq, self.model.num_timesteps
-        if freq is not None and now // freq > max(self._trained_at, 0) // freq:
+        if freq is not None and now // freq > self.model._planner_trained_at // freq:
             self.train_planner()
 
     def _on_training_end(self) -> None:
-        if self._trained_at != self.model.num_timesteps:  # some callers end a training twice
+        # A training that took no steps since the last one, or was ended twice, has nothing new to learn from.
+        is_new = self.model._planner_trained_at != self.model.num_timesteps
+        if is_new and self.model.replay_buffer.size() > 0:
             self.train_planner()
 
     def train_planner(self, gradient_steps: int | None = None) -> None:
@@ -67,11 +73,12 @@ class PlannerTrainingCallback(BaseCallback):
         :param gradient_steps: the agent's ``planner_gradient_steps`` by default
         """
         model = self.model
-        self._trained_at = model.num_timesteps
         trainer = model.make_planner_trainer(gradient_steps)
+        buffer = model.replay_buffer
+        data = {"num_timesteps": model.num_timesteps, "replay": zlib.crc32(buffer.actions[: buffer.size()].data)}
         if self.checkpoint is not None and self.checkpoint.exists():
             state = load_tree(self.checkpoint)
-            if state["num_timesteps"] == model.num_timesteps:
+            if all(state.get(key, value) == value for key, value in data.items()):
                 trainer.load_state_dict(state["trainer"])
         total = trainer.gradient_steps
         bar = tqdm(total=total, initial=trainer.n_updates, desc="planner", disable=not self.progress_bar)
@@ -88,9 +95,11 @@ class PlannerTrainingCallback(BaseCallback):
                         model.logger.record(key, value)
                     model.logger.dump(model.num_timesteps + done)
                 if self.checkpoint is not None and (done % self.save_interval == 0 or done == total):
-                    save_tree(self.checkpoint, {"num_timesteps": model.num_timesteps, "trainer": trainer.state_dict()})
+                    save_tree(self.checkpoint, {**data, "trainer": trainer.state_dict()})
         except KeyboardInterrupt:
             print(f"Planner training interrupted after {trainer.n_updates} of {total} updates; its weights are kept.")
         finally:
             bar.close()
-        model.policy.planner_updates.fill_(float(trainer.n_updates))
+        if trainer.n_updates > 0:  # else an earlier training's stays
+            model.policy.planner_updates.fill_(float(trainer.n_updates))
+        model._planner_trained_at = model.num_timesteps

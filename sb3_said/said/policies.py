@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import fields
 from typing import Any, Literal
 
 import torch as th
@@ -51,6 +52,9 @@ class SAIDPolicy(DelayedSACPolicy):
             )
         state_space, max_delay = check_spaces(observation_space, action_space)
         self.planner_kwargs = planner_kwargs or {}
+        names = [field.name for field in fields(PlannerConfig)]
+        if unknown := sorted(set(self.planner_kwargs) - set(names)):
+            raise ValueError(f"The planner has no setting {', '.join(unknown)}; it has {', '.join(names)}.")
         with th.random.fork_rng(devices=[]):  # the expert learns as it would without a planner
             self.planner = InpaintingPlanner(
                 state_space.shape[0], action_space.shape[0], max_delay, PlannerConfig(**self.planner_kwargs)
@@ -95,31 +99,33 @@ class SAIDPolicy(DelayedSACPolicy):
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         who = self._answer or ("planner" if self.planner_is_trained else "expert")
-        if who == "expert":
-            return super()._predict(observation, deterministic)
-        if not isinstance(observation, dict):
-            n, act_dim = len(observation), self.planner.act_dim
-            observation = {
-                "observation": observation,
-                "action_history": observation.new_zeros(n, 0, act_dim),
-                "delay": observation.new_zeros(n, 1),
-            }
         if not deterministic:
-            return self._plan(observation)
-        # Each row alone: matrix products of another batch size round differently, which can change the candidate chosen.
-        rows = ({key: value[i : i + 1] for key, value in observation.items()} for i in range(len(observation["delay"])))
-        return th.cat([self._plan(row, noise=self._fixed_noise()) for row in rows])
+            return self._plan(observation) if who == "planner" else super()._predict(observation)
+        # Each row alone: matrix products of another batch size round differently, and can change the candidate chosen.
+        if who == "expert":
+            return th.cat([super(SAIDPolicy, self)._predict(row, True) for row in _rows(observation)])
+        noise = self._fixed_noise()
+        return th.cat([self._plan(row, noise) for row in _rows(observation)])
 
-    def _plan(self, observation: dict[str, th.Tensor], noise: th.Tensor | None = None) -> th.Tensor:
+    def _plan(self, observation: PyTorchObs, noise: th.Tensor | None = None) -> th.Tensor:
         """Return the decision of each row: (B, act_dim)."""
-        delay = observation["delay"][:, 0].round().long()
+        if isinstance(observation, dict):
+            states, history, delay = (observation[key] for key in ("observation", "action_history", "delay"))
+            delay = delay[:, 0].long()
+        else:
+            states, history = observation, observation.new_zeros(len(observation), 0, self.planner.act_dim)
+            delay = th.zeros(len(observation), dtype=th.long, device=observation.device)
         if self.planner.config.mask == "fixed":
             # Only D known actions were ever trained. At an episode's start, s_0 then stands for s_{t-D} and zeros for
             # the actions before it (paper, Appendix B).
+            before = th.arange(self.max_delay, device=delay.device) < self.max_delay - delay[:, None]  # (B, D)
+            if (history.ne(0).any(-1) & before).any():
+                raise ValueError(
+                    f"This planner was trained for observations of age {self.max_delay} only (mask='fixed'), but in the "
+                    f"middle of an episode one has age {int(delay.min())}; train with mask='random' for several delays."
+                )
             delay = th.full_like(delay, self.max_delay)
-        return self.planner.plan(
-            observation["observation"], observation["action_history"], delay, value_fn=self.value, noise=noise
-        ).action
+        return self.planner.plan(states, history, delay, value_fn=self.value, noise=noise).action
 
     def _fixed_noise(self) -> th.Tensor:
         """Return the same noise at every call, without touching the global random state: (N, L, obs_dim + act_dim)."""
@@ -133,3 +139,12 @@ class SAIDPolicy(DelayedSACPolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), "planner_kwargs": self.planner_kwargs}
+
+
+def _rows(observation: PyTorchObs) -> Iterator[PyTorchObs]:
+    """Yield each row of a batch as a batch of one."""
+    if not isinstance(observation, dict):
+        yield from observation.split(1)
+        return
+    for i in range(len(observation["delay"])):
+        yield {key: value[i : i + 1] for key, value in observation.items()}

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import configure_logger
 
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.sac import DelayedSAC
 from sb3_said.said.callbacks import PlannerTrainingCallback
 from sb3_said.said.policies import SAIDPolicy
+
+#: Planner settings that shape its answers and none of its weights.
+SAMPLING_SETTINGS = ("solver", "time_grid", "sampling_steps", "n_candidates", "temperature", "scored_states")
+HELD_OUT = 0.05  # of the planner's data, in whole episodes
 
 SelfSAID = TypeVar("SelfSAID", bound="SAID")
 
@@ -31,7 +38,7 @@ class SAID(DelayedSAC):
     :param learning_rate: of the expert
     :param planner_kwargs: fields of :class:`~sb3_said.planner.PlannerConfig`
     :param planner_gradient_steps: updates of one planner training; the paper makes 1,000,000
-    :param planner_train_freq: also train the planner every so many environment steps; by default only at the end (paper)
+    :param planner_train_freq: also train the planner every so many environment steps; the paper only at the end (None)
     :param planner_newest_fraction: train on the newest part of the buffer only (the paper's 20 % is 0.2)
     :param sac_kwargs: every other argument of :class:`~sb3_said.sac.DelayedSAC` and of SB3's ``SAC``
     :raises ValueError: as ``DelayedSAC`` does, and for planner settings outside their range
@@ -56,11 +63,14 @@ class SAID(DelayedSAC):
             if value is not None and value < 1:
                 raise ValueError(f"planner_{name} must be at least 1, got {value}.")
         if not 0.0 < planner_newest_fraction <= 1.0:
-            raise ValueError(f"planner_newest_fraction is a part of the buffer in (0, 1], got {planner_newest_fraction}.")
+            raise ValueError(
+                f"planner_newest_fraction is a part of the buffer in (0, 1], got {planner_newest_fraction}."
+            )
         self.planner_kwargs = planner_kwargs
         self.planner_gradient_steps = planner_gradient_steps
         self.planner_train_freq = planner_train_freq
         self.planner_newest_fraction = planner_newest_fraction
+        self._planner_trained_at = 0  # num_timesteps of the last planner training
         super().__init__(policy, env, learning_rate, **sac_kwargs)
 
     def _policy_flags(self) -> dict[str, Any]:
@@ -77,14 +87,38 @@ class SAID(DelayedSAC):
     ) -> SelfSAID:
         """Run the expert for ``total_timesteps``, then train the planner on what it stored.
 
-        A :class:`PlannerTrainingCallback` among the callbacks is used for the planner; otherwise one is added.
+        A :class:`PlannerTrainingCallback` among the callbacks is used for the planner; otherwise one is added. The
+        expert answers all callbacks, such as ``EvalCallback``, also when the planner has been trained before.
         """
         callbacks = as_callback_list(callback)
         if not any(isinstance(c, PlannerTrainingCallback) for c in callbacks):
             callbacks.append(PlannerTrainingCallback(progress_bar=progress_bar))
-        return super().learn(
-            total_timesteps, callbacks, log_interval, tb_log_name, reset_num_timesteps, progress_bar  # type: ignore[arg-type]
-        )
+        with self.policy.answering("expert"):
+            return super().learn(
+                total_timesteps,
+                callbacks,
+                log_interval,  # type: ignore[arg-type]  # SB3 takes None and says so in its docstring
+                tb_log_name,
+                reset_num_timesteps,
+                progress_bar,
+            )
+
+    def set_planner(self, **settings: Any) -> None:
+        """Change how the planner answers, also after training or loading; ``save`` keeps the change.
+
+        ``model.set_planner(temperature=0.3, n_candidates=50)``
+
+        :param settings: ``solver``, ``time_grid``, ``sampling_steps``, ``n_candidates``, ``temperature`` or
+            ``scored_states`` of :class:`~sb3_said.planner.PlannerConfig`
+        :raises ValueError: for other settings, which the weights depend on, and for values outside their range
+        """
+        if others := sorted(set(settings) - set(SAMPLING_SETTINGS)):
+            raise ValueError(
+                f"Only {', '.join(SAMPLING_SETTINGS)} can be changed, got {', '.join(others)}; "
+                "give it as planner_kwargs of a new agent."
+            )
+        self.policy.planner.config = replace(self.policy.planner.config, **settings)
+        self.policy.planner_kwargs = self.planner_kwargs = {**self.policy.planner_kwargs, **settings}
 
     def make_planner_trainer(self, gradient_steps: int | None = None) -> PlannerTrainer:
         """Return a trainer of this agent's planner on its replay buffer.
@@ -96,7 +130,11 @@ class SAID(DelayedSAC):
             self.planner_newest_fraction, self.gamma, value_fn=self._stored_values, env=self._vec_normalize_env
         )
         return PlannerTrainer(
-            self.policy.planner, source, gradient_steps or self.planner_gradient_steps, seed=self.seed or 0
+            self.policy.planner,
+            source,
+            self.planner_gradient_steps if gradient_steps is None else gradient_steps,
+            held_out=HELD_OUT if len(source.episodes.unique()) > 1 else 0.0,
+            seed=self.seed or 0,
         )
 
     def train_planner(self, gradient_steps: int | None = None, progress_bar: bool = False) -> None:
@@ -107,15 +145,20 @@ class SAID(DelayedSAC):
         :raises ValueError: when the buffer is empty
         """
         callback = PlannerTrainingCallback(progress_bar=progress_bar)
-        if not hasattr(self, "_logger"):
-            self._setup_learn(0, callback, reset_num_timesteps=False)
+        if not hasattr(self, "_logger"):  # not set_logger: learn() makes its own
+            self._logger = configure_logger(self.verbose, self.tensorboard_log, "SAID", reset_num_timesteps=False)
         callback.init_callback(self)
         callback.train_planner(gradient_steps)
 
     def _stored_values(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        states = self._vec_normalize_env.normalize_obs(states) if self._vec_normalize_env else states
+        """Return values as the environment's rewards would sum up, of states as the environment gives them: (B,)."""
+        env = self._vec_normalize_env
+        if env is not None:
+            is_dict = isinstance(self.observation_space, spaces.Dict)
+            states = env.normalize_obs({"observation": states})["observation"] if is_dict else env.normalize_obs(states)  # type: ignore[assignment]
         with th.no_grad():
-            return self.policy.value(*(th.as_tensor(x, device=self.device) for x in (states, actions))).cpu().numpy()
+            values = self.policy.value(*(th.as_tensor(x, device=self.device) for x in (states, actions))).cpu().numpy()
+        return values if env is None else env.unnormalize_reward(values)
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1

@@ -117,7 +117,7 @@ def test_config_refuses(changes, message):
 
 @pytest.mark.parametrize("transform", ["standard", "tanh"])
 def test_normalised_data_has_mean_0_and_deviation_1(transform):
-    normalizer = Normalizer(3, 1, transform)
+    normalizer = Normalizer(3, 1, 4, transform)
     states = th.randn(1000, 3, generator=seeded()) * th.tensor([3.0, 1e-7, 0.0]) + th.tensor([50.0, 0.0, 1.2345])
     actions = (2 * th.randn(1000, 1, generator=seeded(1))).tanh()
     normalizer.fit(states, actions)
@@ -133,7 +133,7 @@ def test_normalised_data_has_mean_0_and_deviation_1(transform):
 @pytest.mark.parametrize("transform", ["standard", "tanh"])
 @given(action=st.floats(-1, 1), prediction=st.floats(-1e3, 1e3), mean=st.floats(-1, 1), std=st.floats(0.1, 3))
 def test_actions_return_from_the_transform_within_bounds(transform, action, prediction, mean, std):
-    normalizer = Normalizer(1, 1, transform)
+    normalizer = Normalizer(1, 1, 4, transform)
     normalizer.action_mean.fill_(mean)
     normalizer.action_std.fill_(std)
     action = th.tensor([action])
@@ -143,13 +143,43 @@ def test_actions_return_from_the_transform_within_bounds(transform, action, pred
     assert -1 <= normalizer.denormalize_actions(th.tensor([prediction])).item() <= 1
 
 
+def test_moves_are_scaled_index_by_index_over_valid_steps():
+    planner, windows = make_planner(relative_states=True), make_windows(40)
+    normalizer = planner.normalizer
+    normalizer.fit_moves(windows)
+    z = normalizer.normalize_states(windows.states)
+    for k in range(1, LENGTH):
+        moves = z[windows.valid[:, k], k] - z[windows.valid[:, k], 0]
+        th.testing.assert_close(normalizer.move_std[k - 1], moves.square().mean(0).sqrt())
+
+
+@pytest.mark.parametrize("relative", [True, False])
+@pytest.mark.parametrize("transform", ["standard", "tanh"])
+def test_windows_return_from_the_planners_units(relative, transform):
+    planner, windows = make_planner(relative_states=relative, action_transform=transform), make_windows()
+    planner.normalizer.fit_moves(windows)
+    states, actions = planner.normalizer.denormalize(planner.normalizer.normalize(windows.states, windows.actions))
+    th.testing.assert_close(states, windows.states, atol=1e-4, rtol=1e-4)
+    th.testing.assert_close(actions, windows.actions.clamp(-0.999, 0.999), atol=2e-3, rtol=0.0)
+
+
+def test_steps_that_never_move_are_not_blown_up():
+    planner = make_planner(relative_states=True)
+    still = th.ones(8, LENGTH, OBS), th.zeros(8, LENGTH, ACT), th.ones(8, LENGTH, dtype=th.bool), th.ones(8)
+    planner.normalizer.fit_moves(Windows(*still))
+    assert th.equal(planner.normalizer.move_std, th.ones(LENGTH - 1, OBS))
+
+
 # --- loss ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("prediction", ["v", "epsilon", "x0"])
 @pytest.mark.parametrize("schedule", ["cosine", "linear"])
-def test_loss_against_a_naive_computation(prediction, schedule):
-    planner, windows = make_planner(prediction=prediction, schedule=schedule), make_windows()
+@pytest.mark.parametrize("relative", [True, False])
+def test_loss_against_a_naive_computation(prediction, schedule, relative):
+    changes = {"prediction": prediction, "schedule": schedule, "relative_states": relative, "decision_weight": 3.0}
+    planner, windows = make_planner(**changes), make_windows()
+    planner.normalizer.move_std.uniform_(0.5, 2.0, generator=seeded(5))
     n = len(windows.states)
     delay, weight = th.tensor([0, 1, 2, 3, 4, 4]), th.rand(n)
     planner.network = network = FakeNetwork(th.randn(n, LENGTH, OBS + ACT))
@@ -163,6 +193,9 @@ def test_loss_against_a_naive_computation(prediction, schedule):
         alpha, sigma = alpha_sigma(t[b], schedule)
         for k in range(LENGTH):
             state = (windows.states[b, k] - normalizer.state_mean) / normalizer.state_std
+            if relative and k > 0:
+                moved = (windows.states[b, k] - windows.states[b, 0]) / normalizer.state_std
+                state = moved / normalizer.move_std[k - 1]
             action = (windows.actions[b, k] - normalizer.action_mean) / normalizer.action_std
             clean = th.cat([state, action])
             for j in range(OBS + ACT):
@@ -176,8 +209,9 @@ def test_loss_against_a_naive_computation(prediction, schedule):
                 if not known:
                     v = alpha * noise[b, k, j] - sigma * clean[j]
                     target = {"v": v, "epsilon": noise[b, k, j], "x0": clean[j]}[prediction]
-                    total += weight[b] * (network.output[b, k, j] - target) ** 2
-                    count += 1
+                    share = 3.0 if k == delay[b] else 1.0
+                    total += weight[b] * share * (network.output[b, k, j] - target) ** 2
+                    count += share
     th.testing.assert_close(loss, total / count, atol=1e-5, rtol=1e-5)
     assert th.equal(network.valid, windows.valid) and th.equal(network.t, t)
 

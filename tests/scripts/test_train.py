@@ -33,8 +33,9 @@ def run(*arguments: str | Path) -> str:
 
 
 def arguments(folder: Path, *more: str) -> list[str]:
-    base = f"--env InvertedPendulum-v5 --delay 2 --preset smoke -n 600 --seed 3 --num-threads 1 --eval-freq 300 -f {folder}"
-    return ["--algo", "said", *base.split(), "--checkpoint-freq", "100", "-params", TINY_PLANNER, *more]
+    base = "--algo said --env InvertedPendulum-v5 --delay 2 --preset smoke -n 600 --seed 3 --num-threads 1"
+    options = "--eval-freq 300 --checkpoint-freq 100"
+    return [*base.split(), *options.split(), "-f", str(folder), "-params", TINY_PLANNER, *more]
 
 
 @pytest.fixture(scope="module")

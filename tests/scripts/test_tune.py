@@ -127,8 +127,7 @@ def test_a_search_from_grid_to_report(
 
     # A grid that grew makes only what is new.
     monkeypatch.setattr(tune, "rollout", rollout)
-    tune.main([*command[:6], "0", "1", "0.5", *QUICK, "--n-trials", "5"] if False else
-              ["--run", str(run), "--depths", "1", "--temperatures", "0", "0.5", "1", *QUICK])  # fmt: skip
+    tune.main(["--run", str(run), "--depths", "1", "--temperatures", "0", "0.5", "1", *QUICK])
     trials = json.loads((run / "tune" / "results.json").read_text())["trials"]
     assert [(t["depth"], t["temperature"]) for t in trials[4:]] == [(1, 0.5)]
 
@@ -223,7 +222,7 @@ def test_a_killed_training_goes_on_bit_for_bit(run: Path, tmp_path: Path, monkey
 
 def test_planners_of_another_training_are_refused(run: Path, tmp_path: Path) -> None:
     make_planners(run, tmp_path, 2).put(2, 0.5)
-    with pytest.raises(ValueError, match="gradient_steps was 2 and is now 4.*delete the file"):
+    with pytest.raises(ValueError, match=r"gradient_steps was 2 and is now 4.*delete the file"):
         make_planners(run, tmp_path, 4).put(2, 0.5)
 
 
@@ -377,5 +376,5 @@ def test_folders_that_cannot_be_tuned(run: Path, tmp_path: Path, capsys: pytest.
 
 def test_a_study_begun_otherwise_is_refused(tmp_path: Path) -> None:
     make_search(tmp_path, [0.0], episodes=2)
-    with pytest.raises(ValueError, match="episodes was 2 and is now 3.*--study-name"):
+    with pytest.raises(ValueError, match=r"episodes was 2 and is now 3.*--study-name"):
         make_search(tmp_path, [0.0], episodes=3)
