@@ -65,7 +65,7 @@ def training_state(model: OffPolicyAlgorithm, callback: BaseCallback | None = No
     :param model: with a ``DelayedReplayBuffer``
     :param callback: whose ``EvalCallback`` evaluations are kept too
     """
-    assert isinstance(model.replay_buffer, DelayedReplayBuffer)
+    replay_buffer = _replay_buffer(model)
     variables = model._get_torch_save_params()[1]
     vec_normalize = model.get_vec_normalize_env()
     return {
@@ -75,7 +75,7 @@ def training_state(model: OffPolicyAlgorithm, callback: BaseCallback | None = No
             **{name: getattr(model, name) for name in _COUNTERS},
             **{name: getattr(model, name) for name in _OPTIONAL_COUNTERS if hasattr(model, name)},
         },
-        "replay_buffer": model.replay_buffer.state_dict(),
+        "replay_buffer": replay_buffer.state_dict(),
         "vec_normalize": None if vec_normalize is None else _vec_normalize_state(vec_normalize),
         "evaluations": [_evaluation_state(e) for e in _eval_callbacks(callback)],
         "random": random_state(),
@@ -93,18 +93,31 @@ def restore_training(model: OffPolicyAlgorithm, path: str | Path, callback: Base
     :param callback: made as the run's, whose ``EvalCallback`` evaluations are restored
     :raises ValueError: when the checkpoint does not fit the model
     """
-    assert isinstance(model.replay_buffer, DelayedReplayBuffer)
+    replay_buffer, eval_callbacks = _replay_buffer(model), _eval_callbacks(callback)
     state = load_tree(path)
-    model.set_parameters(state["parameters"], exact_match=True, device=model.device)
+    if len(eval_callbacks) != len(state["evaluations"]):
+        raise ValueError(
+            f"The run of {path} had {len(state['evaluations'])} EvalCallback and is resumed with "
+            f"{len(eval_callbacks)}; resume with the callbacks of the run."
+        )
+    vec_normalize = model.get_vec_normalize_env()
+    if (vec_normalize is None) != (state["vec_normalize"] is None):
+        raise ValueError(
+            f"The run of {path} was {'not ' if vec_normalize else ''}normalised by VecNormalize, and this model's "
+            f"environment is{'' if vec_normalize else ' not'}; resume with the environment of the run."
+        )
+    try:
+        model.set_parameters(state["parameters"], exact_match=True, device=model.device)
+    except (RuntimeError, AttributeError) as error:
+        raise ValueError(f"{path} is of a model with other networks or optimizers: {error}") from error
     for name, value in state["variables"].items():
         getattr(model, name).data.copy_(value)
     for name, value in state["counters"].items():
         setattr(model, name, value)
-    model.replay_buffer.load_state_dict(state["replay_buffer"])
-    vec_normalize = model.get_vec_normalize_env()
+    replay_buffer.load_state_dict(state["replay_buffer"])
     if vec_normalize is not None:
         _restore_vec_normalize(vec_normalize, state["vec_normalize"])
-    for eval_callback, kept in zip(_eval_callbacks(callback), state["evaluations"], strict=True):
+    for eval_callback, kept in zip(eval_callbacks, state["evaluations"], strict=True):
         _restore_evaluations(eval_callback, kept)
     if model.seed is not None and model.env is not None:
         model.env.seed((model.seed + model.num_timesteps) % 2**31)
@@ -129,6 +142,14 @@ def restore_random_state(state: dict[str, Any]) -> None:
     th.set_rng_state(state["torch"])
     if "cuda" in state and th.cuda.is_available():
         th.cuda.set_rng_state_all(state["cuda"])
+
+
+def _replay_buffer(model: OffPolicyAlgorithm) -> DelayedReplayBuffer:
+    if not isinstance(model.replay_buffer, DelayedReplayBuffer):
+        raise ValueError(
+            f"Checkpoints are of agents with a DelayedReplayBuffer, got {type(model.replay_buffer).__name__}."
+        )
+    return model.replay_buffer
 
 
 def _statistics(vec_normalize: VecNormalize) -> dict[str, RunningMeanStd]:

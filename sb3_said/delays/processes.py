@@ -71,10 +71,14 @@ def make_process(delay: int | tuple[int, int] | DelayProcess) -> DelayProcess:
     :param delay: an integer (fixed), a ``(low, high)`` pair (drawn anew each episode) or a process
     :raises ValueError: for anything else
     """
-    if isinstance(delay, (int, np.integer)) and not isinstance(delay, bool):
-        return FixedDelay(int(delay))
-    if isinstance(delay, (tuple, list)) and len(delay) == 2 and all(isinstance(x, (int, np.integer)) for x in delay):
+    if _is_integer(delay):
+        return FixedDelay(int(delay))  # type: ignore[arg-type]
+    if isinstance(delay, (tuple, list)) and len(delay) == 2 and all(_is_integer(x) for x in delay):
         return EpisodeDelay(int(delay[0]), int(delay[1]))
     if hasattr(delay, "sample") and hasattr(delay, "max_delay"):
         return delay  # type: ignore[return-value]  # a protocol with a property cannot be narrowed to by hasattr
     raise ValueError(f"`delay` is an integer, a (low, high) pair of integers or a delay process, got {delay!r}.")
+
+
+def _is_integer(x: object) -> bool:
+    return isinstance(x, (int, np.integer)) and not isinstance(x, bool)

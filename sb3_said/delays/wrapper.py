@@ -70,7 +70,8 @@ class DelayedObservationWrapper(
 
         self._action_low, self._action_span = act_space.low, act_space.high - act_space.low
         self._action_is_scaled = bool(np.all(act_space.low == -1) and np.all(act_space.high == 1))
-        low, high = (bound.astype(np.float32) for bound in (obs_space.low, obs_space.high))
+        with np.errstate(over="ignore"):  # a float64 bound beyond float32 becomes infinite
+            low, high = (bound.astype(np.float32) for bound in (obs_space.low, obs_space.high))
         self.observation_space = spaces.Dict(
             observation=spaces.Box(low, high, dtype=np.float32),
             action_history=spaces.Box(-1.0, 1.0, (self.max_delay, *act_space.shape), np.float32),
@@ -88,11 +89,14 @@ class DelayedObservationWrapper(
         """Reset the task; s_0 arrives at once.
 
         :param seed: seeds the task and the delay process
+        :raises ValueError: when the process draws a delay outside 0..D
         """
         state, info = self.env.reset(seed=seed, options=options)
         if seed is not None:
             self._rng = np.random.default_rng(seed)
         self._delay = self.process.sample(self._rng)
+        if not 0 <= self._delay <= self.max_delay:
+            raise ValueError(f"{self.process!r} drew a delay of {self._delay}, outside 0..{self.max_delay}.")
         self._age = 0
         self._states.clear()
         self._history[:] = 0.0

@@ -141,7 +141,8 @@ class PlannerTrainer:
                 group["lr"] = rate * factor
             optimizer.zero_grad()
 
-        loss = self.online.loss(windows, delay, value_weight(windows.values, config.weight_factor), self.generator)
+        weight = value_weight(windows.values, config.weight_factor)  # (B,)
+        loss = self.online.loss(windows, delay, weight, self.generator)
         loss.backward()
         if config.gradient_clip is not None:
             th.nn.utils.clip_grad_norm_(self._online, config.gradient_clip)
@@ -149,7 +150,7 @@ class PlannerTrainer:
         with th.no_grad():
             th._foreach_lerp_(self._averaged, self._online, 1.0 - ema_decay(self.n_updates, config))
 
-        yardstick_loss = self.yardstick.loss(*self._yardstick_batch(windows, delay.to(self.device)))
+        yardstick_loss = self.yardstick.loss(*self._yardstick_batch(windows, delay.to(self.device)), weight)
         yardstick_loss.backward()
         self.yardstick_optimizer.step()
 

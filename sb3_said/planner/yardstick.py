@@ -52,14 +52,21 @@ class RegressionYardstick(nn.Module):
         return Present(*self.net(th.cat([state, history.flatten(1), known], dim=1)).split(self.sizes, dim=1))
 
     def loss(
-        self, state: th.Tensor, actions: th.Tensor, delay: th.Tensor, target: Present, valid: th.Tensor
+        self,
+        state: th.Tensor,
+        actions: th.Tensor,
+        delay: th.Tensor,
+        target: Present,
+        valid: th.Tensor,
+        weight: th.Tensor,
     ) -> th.Tensor:
         """Return the mean squared error over states plus that over actions.
 
         :param target: the true present
         :param valid: (B,) bool, False where the episode ended before the decision
+        :param weight: (B,) factor of each window's error, as in the planner's loss
         """
         guess = self(state, actions, delay)
         error = F.mse_loss(guess.state, target.state, reduction="none").mean(1)  # (B,)
         error = error + F.mse_loss(guess.action, target.action, reduction="none").mean(1)
-        return (error * valid).sum() / valid.sum().clamp_min(1)
+        return (error * valid * weight).sum() / valid.sum().clamp_min(1)

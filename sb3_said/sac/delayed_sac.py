@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import pathlib
 from typing import Any, ClassVar
 
 from gymnasium import spaces
@@ -10,7 +12,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_said.common.buffers import DelayedReplayBuffer
-from sb3_said.common.save_util import SafeSaveMixin
+from sb3_said.common.save_util import PickleRefusedError, SafeSaveMixin, load_tree, save_tree
 from sb3_said.sac.policies import DelayedSACPolicy
 
 
@@ -103,3 +105,36 @@ class DelayedSAC(SafeSaveMixin, SAC):
     def _policy_flags(self) -> dict[str, Any]:
         """Return what the policy's constructor needs of this algorithm's own arguments."""
         return {"augment_state": self.augment_state, "delay_reconciled_critic": self.delay_reconciled_critic}
+
+    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        """Write the replay buffer to a file without pickle.
+
+        :param path: of the file, or a binary file object
+        """
+        save_tree(path, self.replay_buffer.state_dict())  # type: ignore[arg-type]
+
+    def load_replay_buffer(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        truncate_last_traj: bool = True,
+        allow_pickle: bool = False,
+    ) -> None:
+        """Read what ``save_replay_buffer`` wrote into this agent's buffer, running no code from the file.
+
+        :param path: of the file, or a binary file object
+        :param truncate_last_traj: of SB3's ``HerReplayBuffer``, without effect here
+        :param allow_pickle: also load files of SB3's own method, which can run any code: only for files you trust
+        :raises ValueError: when the file is no replay, was made with another task, ``buffer_size`` or ``n_envs``, or
+            holds a pickle
+        """
+        try:
+            state = load_tree(path)  # type: ignore[arg-type]
+        except PickleRefusedError as error:
+            if not allow_pickle:
+                raise PickleRefusedError(
+                    f"{error} Unpickling runs whatever code the file's author put there. If you trust the author, use "
+                    "load_replay_buffer(path, allow_pickle=True), and save it again to get a file without pickle."
+                ) from error
+            super().load_replay_buffer(path, truncate_last_traj)
+            return
+        self.replay_buffer.load_state_dict(state)

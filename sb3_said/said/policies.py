@@ -92,10 +92,9 @@ class SAIDPolicy(DelayedSACPolicy):
         :param actions: (..., act_dim) in [-1, 1]
         :return: (...)
         """
-        flat: PyTorchObs = states.flatten(0, -2)
-        if self.replay_space is not None:
-            flat = {UNDELAYED: flat}
-        return th.cat(self.critic(flat, actions.flatten(0, -2)), dim=1).amin(1).view(states.shape[:-1])
+        flat = states.flatten(0, -2)
+        observation: PyTorchObs = flat if self.replay_space is None else {UNDELAYED: flat}
+        return th.cat(self.critic(observation, actions.flatten(0, -2)), dim=1).amin(1).view(states.shape[:-1])
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         who = self._answer or ("planner" if self.planner_is_trained else "expert")
@@ -119,10 +118,11 @@ class SAIDPolicy(DelayedSACPolicy):
             # Only D known actions were ever trained. At an episode's start, s_0 then stands for s_{t-D} and zeros for
             # the actions before it (paper, Appendix B).
             before = th.arange(self.max_delay, device=delay.device) < self.max_delay - delay[:, None]  # (B, D)
-            if (history.ne(0).any(-1) & before).any():
+            amid = (history.ne(0).any(-1) & before).any(1)  # (B,): acted on longer ago than the observation is old
+            if amid.any():
                 raise ValueError(
-                    f"This planner was trained for observations of age {self.max_delay} only (mask='fixed'), but in the "
-                    f"middle of an episode one has age {int(delay.min())}; train with mask='random' for several delays."
+                    f"This planner was trained for observations of age {self.max_delay} only (mask='fixed'), but "
+                    f"one amid an episode has age {int(delay[amid][0])}; train with mask='random' for several delays."
                 )
             delay = th.full_like(delay, self.max_delay)
         return self.planner.plan(states, history, delay, value_fn=self.value, noise=noise).action

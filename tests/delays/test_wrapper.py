@@ -1,0 +1,249 @@
+"""The delayed world: exact ages, histories and true states at every step of whole episodes."""
+
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.utils.env_checker import check_env as check_gymnasium_env
+from stable_baselines3.common.env_checker import check_env as check_sb3_env
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
+
+from sb3_said.delays import DelayedObservationWrapper, EpisodeDelay, FixedDelay
+
+LOW, HIGH = np.array([-2.0, 0.0], np.float32), np.array([2.0, 8.0], np.float32)
+
+
+class LoggedTask(gym.Env):
+    """Float64 random states and lop-sided action bounds; logs what it was really in and given, an episode a list."""
+
+    def __init__(self, length=12, low=LOW, high=HIGH):
+        self.observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float64)
+        self.action_space = spaces.Box(low, high, dtype=np.float32)
+        self.length = length
+        self.states, self.actions = [], []
+        self.buffer = np.zeros(3)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.states.append([])
+        self.actions.append([])
+        return self._state(), {"options": options}
+
+    def step(self, action):
+        self.actions[-1].append(np.array(action))
+        ended = len(self.actions[-1]) == self.length
+        return self._state(), float(action[0]), ended, False, {"t": len(self.actions[-1])}
+
+    def _state(self):
+        self.buffer[:] = self.np_random.normal(size=3)  # in place, as some simulators do
+        self.states[-1].append(self.buffer.astype(np.float32))
+        return self.buffer
+
+
+class TableDelay:
+    """A user's own process."""
+
+    def __init__(self, max_delay, draws):
+        self.max_delay = max_delay
+        self.draws = iter(draws)
+
+    def sample(self, rng):
+        return next(self.draws)
+
+
+def assert_observation(obs, task, delay, max_delay):
+    """Compare with the log: s_{t-min(t, d)}, the actions a_{t-D..t-1} and nothing younger or older."""
+    states, actions = task.states[-1], task.actions[-1]
+    t = len(actions)
+    age = min(t, delay)
+    assert obs["delay"].tolist() == [age]
+    np.testing.assert_array_equal(obs["observation"], states[t - age])
+    history = np.zeros((max_delay, 2))
+    for k in range(1, min(t, max_delay) + 1):
+        history[-k] = 2 * (actions[t - k] - LOW) / (HIGH - LOW) - 1
+    np.testing.assert_allclose(obs["action_history"], history, atol=1e-6)
+    assert {key: (x.dtype, x.shape) for key, x in obs.items()} == {
+        "observation": (np.float32, (3,)),
+        "action_history": (np.float32, (max_delay, 2)),
+        "delay": (np.float32, (1,)),
+    }
+
+
+@pytest.mark.parametrize(
+    ("delay", "max_delay"), [(0, 0), (1, 1), (4, 4), (4, 7), (0, 3), (11, 11), (12, 12), (40, 40), ((0, 5), 5), ((2, 3), 9)]
+)
+def test_every_step_of_whole_episodes(delay, max_delay):
+    task = LoggedTask()
+    env = DelayedObservationWrapper(task, delay, max_delay=max_delay)
+    env.action_space.seed(0)
+    drawn = set()
+    for episode in range(12):
+        obs, info = env.reset(seed=0 if episode == 0 else None, options={"n": episode})
+        drawn.add(env._delay)
+        assert_observation(obs, task, env._delay, max_delay)
+        assert info["options"] == {"n": episode}
+        np.testing.assert_array_equal(info["undelayed_observation"], task.states[-1][0])
+        for t in range(1, task.length + 1):
+            action = env.action_space.sample()
+            obs, reward, terminated, truncated, info = env.step(action)
+            assert_observation(obs, task, env._delay, max_delay)
+            # the reward and the end are this step's, as old as the observation may be
+            assert (reward, terminated, truncated, info["t"]) == (float(action[0]), t == task.length, False, t)
+            np.testing.assert_array_equal(info["undelayed_observation"], task.states[-1][-1])
+    low, high = delay if isinstance(delay, tuple) else (delay, delay)
+    assert drawn <= set(range(low, high + 1))
+    assert len(drawn) > 1 or low == high
+
+
+def test_earlier_observations_do_not_change():
+    env = DelayedObservationWrapper(LoggedTask(), 2)
+    obs, info = env.reset(seed=0)
+    outputs = [(obs, info)]
+    for _ in range(5):
+        obs, *_, info = env.step(env.action_space.sample())
+        outputs.append((obs, info))
+    kept = [{**{key: x.copy() for key, x in obs.items()}, "info": info["undelayed_observation"].copy()} for obs, info in outputs]
+    env.reset()
+    env.step(env.action_space.sample())
+    for (obs, info), copies in zip(outputs, kept, strict=True):
+        for key, value in {**obs, "info": info["undelayed_observation"]}.items():
+            np.testing.assert_array_equal(value, copies[key])
+
+
+def test_history_holds_what_was_executed():
+    env = DelayedObservationWrapper(LoggedTask(), 1)
+    env.reset(seed=0)
+    for action, scaled in [(LOW, [-1, -1]), (HIGH, [1, 1]), ([0, 4], [0, 0]), ([9, -9], [1, -1]), ([1, 2], [0.5, -0.5])]:
+        obs = env.step(np.array(action, np.float32))[0]
+        np.testing.assert_array_equal(obs["action_history"], [scaled])
+
+
+def test_history_is_bit_for_bit_the_action_where_bounds_are_one():
+    env = DelayedObservationWrapper(LoggedTask(low=-np.ones(2, np.float32), high=np.ones(2, np.float32)), 1)
+    env.reset(seed=0)
+    for _ in range(10):
+        action = env.action_space.sample()
+        np.testing.assert_array_equal(env.step(action)[0]["action_history"], [action])
+
+
+def test_seeds():
+    def delays(seed, n=30):
+        env = DelayedObservationWrapper(LoggedTask(), (0, 8))
+        drawn = []
+        for episode in range(n):
+            obs, _ = env.reset(seed=seed if episode == 0 else None)
+            drawn.append((env._delay, *obs["observation"]))
+        return drawn
+
+    assert delays(1) == delays(1)
+    assert delays(1) != delays(2)
+    assert {delay for delay, *_ in delays(1)} == set(range(9))  # a new delay each episode, all of the range
+
+
+def test_parallel_environments_draw_their_own_delays():
+    vec = make_vec_env(lambda: DelayedObservationWrapper(LoggedTask(), (0, 50)), n_envs=4, seed=0)
+    vec.reset()
+    assert len(set(vec.get_attr("_delay"))) > 1
+
+
+@pytest.mark.parametrize("delay", [0, 3, (0, 8)])
+@pytest.mark.parametrize("name", ["Pendulum-v1", "Hopper-v5"])
+@pytest.mark.filterwarnings("ignore::UserWarning")  # both recommend other bounds, of the tasks themselves
+def test_checkers_of_gymnasium_and_sb3(name, delay):
+    check_gymnasium_env(DelayedObservationWrapper(gym.make(name).unwrapped, delay), skip_render_check=True)
+    check_sb3_env(DelayedObservationWrapper(gym.make(name), delay), warn=False)
+
+
+def test_made_again_from_its_spec():
+    env = gym.make(DelayedObservationWrapper(gym.make("Pendulum-v1"), (1, 3), max_delay=5).spec)
+    assert isinstance(env, DelayedObservationWrapper)
+    assert (env.process, env.max_delay) == (EpisodeDelay(1, 3), 5)
+
+
+def make_pendulum(delay):
+    return Monitor(DelayedObservationWrapper(gym.make("Pendulum-v1", max_episode_steps=7), delay))
+
+
+@pytest.mark.parametrize("vec_env_cls", [None, SubprocVecEnv])
+@pytest.mark.parametrize("delay", [0, 3])
+def test_in_vectorised_normalised_monitored_environments(vec_env_cls, delay):
+    vec = make_vec_env(partial(make_pendulum, delay), n_envs=2, seed=3, vec_env_cls=vec_env_cls)
+    vec = VecNormalize(vec, norm_obs_keys=["observation"])
+    vec.reset()
+    log = [np.stack([info["undelayed_observation"] for info in vec.venv.reset_infos])]
+    for t in range(1, 8):
+        obs, _, dones, infos = vec.step(np.full((2, 1), 1.0))
+        log.append(np.stack([info["undelayed_observation"] for info in infos]))
+        assert dones.all() == (t == 7)
+        arrived = log[t - min(t, delay)]
+        if t == 7:  # VecNormalize normalises this one in place
+            last = vec.unnormalize_obs(infos[0]["terminal_observation"])
+            np.testing.assert_allclose(last["observation"], arrived[0], atol=1e-5)
+        else:  # ages and actions are not normalised
+            np.testing.assert_array_equal(vec.get_original_obs()["observation"], arrived)
+            np.testing.assert_array_equal(obs["delay"], np.full((2, 1), min(t, delay)))
+            n_sent = min(t, delay)
+            np.testing.assert_array_equal(obs["action_history"][:, delay - n_sent :], np.full((2, n_sent, 1), 0.5))
+    assert infos[0]["episode"]["l"] == 7
+    vec.close()
+
+
+def test_wide_bounds_become_infinite():
+    task = LoggedTask()
+    task.observation_space = spaces.Box(-1e300, 1e300, (3,), np.float64)  # more than float32 can hold
+    box = DelayedObservationWrapper(task).observation_space["observation"]
+    assert np.all(box.low == -np.inf) and np.all(box.high == np.inf)
+
+
+@pytest.mark.parametrize(
+    ("attribute", "space", "remedy"),
+    [
+        ("observation_space", spaces.Box(-1, 1, (3, 3)), "FlattenObservation"),
+        ("observation_space", spaces.Box(-1, 1, ()), "FlattenObservation"),
+        ("observation_space", spaces.Discrete(3), "FlattenObservation"),
+        ("observation_space", spaces.Dict(a=spaces.Box(-1, 1, (3,))), "FlattenObservation"),
+        ("action_space", spaces.Discrete(3), "RescaleAction"),
+        ("action_space", spaces.Box(-np.inf, 1, (2,)), "RescaleAction"),
+        ("action_space", spaces.Box(-1, 1, (2, 2)), "RescaleAction"),
+    ],
+)
+def test_other_spaces_are_refused_with_a_remedy(attribute, space, remedy):
+    task = LoggedTask()
+    setattr(task, attribute, space)
+    with pytest.raises(ValueError, match=remedy):
+        DelayedObservationWrapper(task)
+
+
+def test_wrapping_twice_is_refused():
+    with pytest.raises(ValueError, match="1-D Box observation"):
+        DelayedObservationWrapper(DelayedObservationWrapper(LoggedTask(), 1), 1)
+
+
+def test_max_delay_below_the_delay_is_refused():
+    with pytest.raises(ValueError, match="max_delay=3 is smaller than the largest delay 4"):
+        DelayedObservationWrapper(LoggedTask(), (0, 4), max_delay=3)
+
+
+def test_a_users_own_process():
+    env = DelayedObservationWrapper(LoggedTask(), TableDelay(3, [3, 0, 2]))
+    assert env.max_delay == 3
+    for delay in [3, 0, 2]:
+        env.reset()
+        ages = [env.step(env.action_space.sample())[0]["delay"].item() for _ in range(6)]
+        assert ages == [min(t, delay) for t in range(1, 7)]
+
+
+@pytest.mark.parametrize("draw", [-1, 4])
+def test_a_process_outside_its_range_is_refused(draw):
+    # A negative delay would hand out the oldest state as the newest.
+    env = DelayedObservationWrapper(LoggedTask(), TableDelay(3, [draw]))
+    with pytest.raises(ValueError, match=f"drew a delay of {draw}"):
+        env.reset()
+
+
+def test_fixed_process_equals_integer():
+    assert DelayedObservationWrapper(LoggedTask(), 6).process == FixedDelay(6)

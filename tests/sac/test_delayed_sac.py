@@ -1,0 +1,343 @@
+"""DelayedSAC: what each flag makes actor and critics read, SB3's SAC where nothing is delayed, and what it refuses."""
+
+import inspect
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.save_util import save_to_pkl
+from stable_baselines3.common.torch_layers import CombinedExtractor
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_said import DelayedObservationWrapper, DelayedSAC
+from sb3_said.common.buffers import UNDELAYED
+
+AUGMENTED = {"observation", "action_history", "delay"}
+
+
+class Drift(gym.Env):
+    """The state moves with the action; +1 a step for ``length`` steps, then the episode ends or is cut off."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
+    action_space = spaces.Box(-2.0, 2.0, (1,), np.float32)
+
+    def __init__(self, length=12, truncates=True):
+        self.length, self.truncates = length, truncates
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t, self.state = 0, self.np_random.normal(size=2).astype(np.float32)
+        return self.state.copy(), {}
+
+    def step(self, action):
+        self.t += 1
+        self.state = (0.9 * self.state + 0.1 * np.array([action[0], self.state[0]])).astype(np.float32)
+        end = self.t >= self.length
+        return self.state.copy(), 1.0, end and not self.truncates, end and self.truncates, {}
+
+
+def delayed(delay=2, max_delay=None, **kwargs):
+    return DelayedObservationWrapper(Drift(**kwargs), delay, max_delay=max_delay)
+
+
+def make(env=None, cls=DelayedSAC, policy="MlpPolicy", **kwargs):
+    arguments = {"learning_starts": 20, "batch_size": 16, "buffer_size": 500, "seed": 0, "device": "cpu"}
+    env = delayed() if env is None else env
+    return cls(policy, env, **(arguments | {"policy_kwargs": {"net_arch": [16]}} | kwargs))
+
+
+def observe(n_steps=5, **kwargs):
+    env = delayed(**kwargs)
+    obs, _ = env.reset(seed=0)
+    for k in range(n_steps):
+        obs = env.step(np.array([0.5 + 0.1 * k], np.float32))[0]
+    return obs
+
+
+def assert_same_parameters(first, second, **tolerance):
+    first, second = first.get_parameters(), second.get_parameters()
+    assert first.keys() == second.keys()
+    th.testing.assert_close(first, second, **({"rtol": 0, "atol": 0} | tolerance))
+
+
+# ---------------------------------------------------------------------------------------------------- what is read
+
+
+@pytest.mark.parametrize(
+    ("augment_state", "delay_reconciled_critic", "actor_reads", "critic_reads"),
+    [
+        (False, False, {"observation"}, {"observation"}),  # SAC
+        (True, False, AUGMENTED, AUGMENTED),  # SA
+        (False, True, {"observation"}, {UNDELAYED}),  # DR
+        (True, True, AUGMENTED, {UNDELAYED}),  # SADR
+    ],
+)
+def test_what_actor_and_critics_read(augment_state, delay_reconciled_critic, actor_reads, critic_reads):
+    model = make(augment_state=augment_state, delay_reconciled_critic=delay_reconciled_critic).learn(40)
+    batch = model.replay_buffer.sample(8)
+    assert set(batch.observations) == AUGMENTED | {UNDELAYED}
+
+    def outputs(observation):
+        policy = model.policy
+        return {
+            "actor": policy.actor(observation, deterministic=True),
+            "critic": th.cat(policy.critic(observation, batch.actions)),
+            "target": th.cat(policy.critic_target(observation, batch.actions)),
+        }
+
+    before, read = outputs(batch.observations), {"actor": set(), "critic": set(), "target": set()}
+    for key in batch.observations:
+        after = outputs(batch.observations | {key: batch.observations[key] + 0.5})
+        for network in read:
+            if not th.equal(before[network], after[network]):
+                read[network].add(key)
+    assert read == {"actor": actor_reads, "critic": critic_reads, "target": critic_reads}
+
+
+def test_every_part_of_the_augmented_state_is_read():
+    policy, obs = make(delayed(3)).policy, observe(delay=3)
+    answer = policy.predict(obs, deterministic=True)[0]
+    for key, values in obs.items():
+        for index in np.ndindex(values.shape):
+            changed = values.copy()
+            changed[index] = 2.0 if key == "delay" else -0.5 * values[index]
+            assert policy.predict(obs | {key: changed}, deterministic=True)[0] != answer, (key, index)
+
+
+# ---------------------------------------------------------------------------------------------------- as SB3's SAC
+
+
+def normalized(n_envs):
+    return VecNormalize(make_vec_env(Drift, n_envs=n_envs, seed=0), gamma=0.95)
+
+
+@pytest.mark.parametrize(
+    ("make_env", "kwargs"),
+    [
+        (Drift, {}),
+        (lambda: Drift(truncates=False), {"buffer_size": 50, "ent_coef": 0.1}),  # the buffer wraps around
+        (lambda: make_vec_env(Drift, n_envs=3, seed=0), {"gradient_steps": 2, "buffer_size": 60}),
+        (lambda: normalized(2), {"target_update_interval": 2, "action_noise": NormalActionNoise([0.0], [0.3])}),
+        (Drift, {"use_sde": True, "train_freq": (1, "episode"), "gradient_steps": -1}),
+    ],
+    ids=["plain", "terminations and a full buffer", "three environments", "VecNormalize", "gSDE"],
+)
+def test_without_delay_it_learns_as_sb3s_sac(make_env, kwargs):
+    runs = []
+    for cls in (SAC, DelayedSAC):
+        model = make(make_env(), cls, **kwargs)
+        model.set_logger(Logger(None, []))
+        model.learn(130, log_interval=None)
+        runs.append((model, dict(model.logger.name_to_value)))
+    (sac, expected), (ours, losses) = runs
+    assert {"train/actor_loss", "train/critic_loss"} <= losses.keys()
+    assert losses["train/n_updates"] > 50
+    assert losses == pytest.approx(expected, rel=1e-5)
+    assert_same_parameters(sac, ours, rtol=1e-5, atol=1e-6)
+    obs = np.array([[0.1, -0.2], [0.3, 0.4]], np.float32)
+    np.testing.assert_allclose(
+        ours.predict(obs, deterministic=True)[0], sac.predict(obs, deterministic=True)[0], atol=1e-5
+    )
+
+
+@pytest.mark.parametrize(
+    "wrap", [lambda env: env, lambda env: DelayedObservationWrapper(env, 2)], ids=["plain", "delayed"]
+)
+@pytest.mark.parametrize("truncates", [True, False])
+def test_a_time_limit_is_no_end(wrap, truncates):
+    model = make(
+        wrap(Drift(length=5, truncates=truncates)), gamma=0.8, ent_coef=0.0, tau=0.05, learning_rate=1e-2, batch_size=64
+    )
+    model.learn(600)
+    batch = model.replay_buffer.sample(200)
+    with th.no_grad():
+        values = th.cat(model.critic(batch.observations, batch.actions), dim=1).numpy()
+    if truncates:  # reward 1 for ever
+        assert batch.dones.sum() == 0
+        np.testing.assert_allclose(values, 1 / (1 - 0.8), rtol=0.1)
+    else:  # 1 before the end, 3.4 with five steps to go
+        assert batch.dones.sum() > 0
+        assert values.mean() < 3.4
+
+
+def test_the_last_state_of_an_episode_is_what_is_bootstrapped_from():
+    model = make(delayed(length=4)).learn(40)
+    buffer = model.replay_buffer
+    ends = np.flatnonzero(buffer.timeouts[: buffer.size(), 0])
+    batch = buffer._get_samples(ends)
+    stepped = 0.9 * batch.observations[UNDELAYED] + 0.1 * th.stack(
+        [2.0 * batch.actions[:, 0], batch.observations[UNDELAYED][:, 0]], dim=1
+    )
+    assert len(ends) == 10 and batch.dones.sum() == 0
+    th.testing.assert_close(batch.next_observations[UNDELAYED], stepped)
+
+
+# ---------------------------------------------------------------------------------------------------- SB3's contract
+
+
+def test_every_argument_has_a_default_and_is_an_attribute():
+    parameters = list(inspect.signature(DelayedSAC.__init__).parameters.values())[3:]
+    own = [p for p in parameters if p.kind is not p.VAR_KEYWORD]
+    assert [p.name for p in own] == ["learning_rate", "augment_state", "delay_reconciled_critic"]
+    assert all(p.default is not p.empty for p in own)
+    given = {"learning_rate": 0.01, "augment_state": False, "delay_reconciled_critic": False, "tau": 0.1, "gamma": 0.9}
+    assert {name: getattr(make(**given), name) for name in given} == given
+
+
+@pytest.mark.parametrize("env", [Drift, delayed])
+def test_both_policy_names_are_the_same_policy(env):
+    models = [make(env(), policy=name).learn(40) for name in ("MlpPolicy", "MultiInputPolicy")]
+    assert_same_parameters(*models)
+
+
+def test_the_seed_decides():
+    def run(seed):
+        env = VecNormalize(make_vec_env(delayed, n_envs=2, seed=seed), norm_obs_keys=["observation"])
+        return make(env, seed=seed).learn(60)
+
+    first, again, other = run(1), run(1), run(2)
+    assert_same_parameters(first, again)
+    with pytest.raises(AssertionError):
+        assert_same_parameters(first, other)
+
+
+def test_save_and_load(tmp_path):
+    model = make(augment_state=False, policy_kwargs={"net_arch": [8], "activation_fn": th.nn.Tanh}).learn(40)
+    model.save(tmp_path / "agent")
+    loaded = DelayedSAC.load(tmp_path / "agent", device="cpu")
+    obs = observe()
+    np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
+    assert (loaded.augment_state, loaded.num_timesteps) == (False, 40)
+    assert_same_parameters(model, loaded)
+    loaded.set_env(delayed())
+    assert loaded.learn(40, reset_num_timesteps=False).num_timesteps == 80
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        DelayedSAC.load(tmp_path / "agent", env=delayed(3))
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        model.set_env(delayed(3))
+
+
+def test_parameters_are_taken_over(tmp_path):
+    trained, other = make().learn(40), make(seed=5)
+    other.set_parameters(trained.get_parameters())
+    assert_same_parameters(trained, other)
+    trained.policy.save(tmp_path / "policy")
+    policy = type(trained.policy).load(tmp_path / "policy", device="cpu")
+    np.testing.assert_array_equal(
+        policy.predict(observe(), deterministic=True)[0], trained.predict(observe(), deterministic=True)[0]
+    )
+
+
+def test_evaluation_and_a_wrapper_without_delay():
+    model = make(delayed(0)).learn(40)
+    for policy in (model, model.policy):
+        assert evaluate_policy(policy, delayed(0), n_eval_episodes=2)[0] == pytest.approx(12.0)
+    batch = {key: np.stack([value] * 3) for key, value in observe(delay=0).items()}
+    assert model.predict(batch)[0].shape == (3, 1)
+
+
+def test_replay_is_saved_without_pickle(tmp_path):
+    model, other = make().learn(30), make()
+    model.save_replay_buffer(tmp_path / "replay.pkl")  # the name that rl_zoo3 gives
+    other.load_replay_buffer(tmp_path / "replay.pkl")
+    assert other.replay_buffer.size() == 30
+    np.testing.assert_array_equal(other.replay_buffer.observations, model.replay_buffer.observations)
+    with pytest.raises(ValueError, match="does not fit"):
+        make(delayed(), buffer_size=20).load_replay_buffer(tmp_path / "replay.pkl")
+
+    save_to_pkl(tmp_path / "pickled.pkl", model.replay_buffer)
+    with pytest.raises(ValueError, match="allow_pickle=True"):
+        make().load_replay_buffer(tmp_path / "pickled.pkl")
+    (opted_in := make()).load_replay_buffer(tmp_path / "pickled.pkl", allow_pickle=True)
+    assert opted_in.replay_buffer.size() == 30
+
+
+# ---------------------------------------------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"n_steps": 3}, "one-step targets"),
+        ({"replay_buffer_class": DictReplayBuffer}, "DelayedReplayBuffer"),
+        ({"optimize_memory_usage": True}, "optimize_memory_usage"),
+        ({"policy_kwargs": {"share_features_extractor": True}}, "share_features_extractor"),
+        ({"policy_kwargs": {"features_extractor_class": CombinedExtractor}}, "features_extractor_class"),
+        ({"policy_kwargs": {"augment_state": False}}, "augment_state to DelayedSAC itself"),
+        ({"policy": "CnnPolicy"}, "CnnPolicy"),
+        ({"buffer_size": 3}, "buffer_size"),
+        ({"env": VecNormalize(make_vec_env(delayed))}, r"norm_obs_keys=\['observation'\]"),
+    ],
+)
+def test_arguments_that_cannot_work_are_refused(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        make(**kwargs)
+
+
+def test_rewards_alone_may_be_normalized():
+    assert make(VecNormalize(make_vec_env(delayed), norm_obs=False)).learn(30).num_timesteps == 30
+
+
+def test_other_buffers_are_refused_without_delay_too():
+    with pytest.raises(ValueError, match="DelayedReplayBuffer, got ReplayBuffer"):
+        make(Drift(), replay_buffer_class=ReplayBuffer)
+
+
+def changed(**parts):
+    return {**observe(), **parts}
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+@pytest.mark.parametrize(
+    ("obs", "message"),
+    [
+        (changed(observation=np.array([np.nan, 0.0], np.float32)), "observation has entries that are NaN"),
+        (changed(observation=np.array([0.0, np.inf], np.float32)), "observation has entries that are NaN or infinite"),
+        (changed(action_history=np.full((2, 1), np.nan, np.float32)), "action_history has entries that are NaN"),
+        (changed(delay=np.array([np.nan], np.float32)), "delay has entries that are NaN"),
+        (changed(delay=np.array([3.0], np.float32)), r"0\.\.2: the agent was built for max_delay=2"),
+        (changed(delay=np.array([-1.0], np.float32)), r"whole numbers in 0\.\.2"),
+        (changed(delay=np.array([0.5], np.float32)), r"whole numbers in 0\.\.2"),
+        (changed(action_history=np.full((2, 1), 1.5, np.float32)), r"scaled to \[-1, 1\]"),
+        (changed(observation=np.zeros(3, np.float32)), r"observation has the shape \(3,\), expected \(2,\)"),
+        (observe(delay=3), r"action_history has the shape \(3, 1\).*another task or max_delay"),
+        (changed(delay=np.zeros((4, 1), np.float32)), "differ in how many"),
+        ({"observation": np.zeros(2, np.float32)}, "DelayedObservationWrapper"),
+        (changed(undelayed_observation=np.zeros(2, np.float32)), "undelayed_observation"),
+        (np.zeros(2, np.float32), "got ndarray"),
+        ((observe(), {}), "tuple"),
+    ],
+)
+def test_bad_observations_are_refused_before_anything_is_computed(obs, message, deterministic, monkeypatch):
+    model = make()
+
+    def computed(*_, **__):
+        raise AssertionError("the actor was asked")
+
+    monkeypatch.setattr(model.policy.actor, "forward", computed)
+    state = th.get_rng_state()
+    with pytest.raises(ValueError, match=message):
+        model.predict(obs, deterministic=deterministic)
+    assert th.equal(state, th.get_rng_state())
+
+
+@pytest.mark.parametrize(
+    ("obs", "message"),
+    [
+        (np.array([np.nan, 0.0]), "NaN"),
+        (np.zeros(3), r"shape \(3,\), expected \(2,\)"),
+        (np.zeros((2, 3, 2)), "shape"),
+        (observe(), "without delay"),
+    ],
+)
+def test_bad_observations_are_refused_without_delay_too(obs, message):
+    with pytest.raises(ValueError, match=message):
+        make(Drift()).predict(obs)

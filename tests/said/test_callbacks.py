@@ -1,0 +1,266 @@
+"""Training the planner: when, on what, with what to watch it by, and on from where it was interrupted."""
+
+import io
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.logger import KVWriter, Logger
+
+from sb3_said import SAID, DelayedObservationWrapper, PlannerTrainingCallback
+from sb3_said.common.checkpoint import TrainingCheckpointCallback, restore_training
+from sb3_said.common.save_util import load_tree, save_tree
+from sb3_said.planner.trainer import PlannerTrainer
+from sb3_said.said.callbacks import PLANNER_CHECKPOINT_NAME
+
+PLANNER = {"d_model": 32, "depth": 1, "horizon": 3, "batch_size": 16, "sampling_steps": 2, "n_candidates": 3}
+
+
+def make(**kwargs):
+    env = DelayedObservationWrapper(gym.make("Pendulum-v1", max_episode_steps=15), 2)
+    arguments = {"learning_starts": 20, "batch_size": 16, "buffer_size": 500, "seed": 0, "device": "cpu"}
+    arguments |= {"policy_kwargs": {"net_arch": [16]}, "planner_kwargs": PLANNER, "planner_gradient_steps": 6}
+    return SAID("MlpPolicy", env, **(arguments | kwargs))
+
+
+def planner_of(model):
+    return {name: value.clone() for name, value in model.policy.planner.state_dict().items()}
+
+
+def assert_same(first, second):
+    th.testing.assert_close(first, second, rtol=0, atol=0)
+
+
+def differ(first, second):
+    return any(not th.equal(first[name], second[name]) for name in first)
+
+
+class Memory(KVWriter):
+    """Keeps the rows of a log."""
+
+    def __init__(self):
+        self.rows = []
+
+    def write(self, key_values, key_excluded, step=0):
+        self.rows.append({**key_values, "step": step})
+
+    def close(self):
+        pass
+
+
+@pytest.fixture
+def trainings(monkeypatch):
+    """The trainers that made updates, each with how many."""
+    made, original = {}, PlannerTrainer.step
+
+    def step(self):
+        made.setdefault(self, 0)
+        original(self)
+        made[self] += 1
+
+    monkeypatch.setattr(PlannerTrainer, "step", step)
+    return made
+
+
+def begun(trainings):
+    """Return the stored steps that each training began with."""
+    return [trainer._settings["n_windows"] for trainer in trainings]
+
+
+def interrupt_at(monkeypatch, update, error):
+    """Let the update of this number fail, once."""
+    original, raised = PlannerTrainer.step, []
+
+    def step(self):
+        if self.n_updates == update and not raised:
+            raised.append(True)
+            raise error
+        original(self)
+
+    monkeypatch.setattr(PlannerTrainer, "step", step)
+
+
+# ---------------------------------------------------------------------------------------------------- when
+
+
+@pytest.mark.parametrize(
+    ("planner_train_freq", "expected"), [(None, [100]), (40, [40, 80, 100]), (50, [50, 100]), (300, [100])]
+)
+def test_when_the_planner_is_trained(trainings, planner_train_freq, expected):
+    model = make(planner_train_freq=planner_train_freq).learn(100)
+    assert begun(trainings) == expected
+    assert list(trainings.values()) == [6] * len(expected)
+    assert model.policy.planner_updates == 6
+
+
+def test_learning_on_and_counting_anew(trainings):
+    model = make(planner_train_freq=40, buffer_size=200).learn(70)
+    assert begun(trainings) == [40, 70]
+    model.learn(30, reset_num_timesteps=False)
+    assert begun(trainings)[2:] == [80, 100]
+    model.learn(0, reset_num_timesteps=False)
+    assert len(trainings) == 4
+    model.learn(50)  # steps 0 to 50 again, on top of the 100 stored
+    assert begun(trainings)[4:] == [140, 150]
+
+
+def test_a_callback_of_the_users_is_the_one_that_trains(trainings, tmp_path):
+    mine = PlannerTrainingCallback(folder=tmp_path)
+    make().learn(40, CallbackList([CallbackList([mine])]))
+    assert begun(trainings) == [40] and (tmp_path / PLANNER_CHECKPOINT_NAME).exists()
+    mine.on_training_end()  # some callers end a training twice
+    assert len(trainings) == 1
+
+
+def test_no_network_lives_in_the_callback():
+    callback = PlannerTrainingCallback()
+    model = make().learn(40, callback)
+
+    def holds_tensors(value):
+        return isinstance(value, (th.nn.Module, th.Tensor, th.optim.Optimizer, PlannerTrainer))
+
+    of_sb3 = {"model", "locals", "globals", "parent"}
+    own = [value for name, value in vars(callback).items() if name not in of_sb3]
+    assert callback.model is model and not any(map(holds_tensors, own))
+
+
+# ---------------------------------------------------------------------------------------------------- watching
+
+
+def test_losses_are_logged_and_a_bar_is_shown(capsys):
+    memory = Memory()
+    model = make(planner_gradient_steps=5)
+    model.set_logger(Logger(None, [memory]))
+    model.learn(45, PlannerTrainingCallback(log_interval=2, eval_interval=4, progress_bar=True), log_interval=None)
+    rows = [row for row in memory.rows if "planner/loss" in row]
+    assert [row["planner/n_updates"] for row in rows] == [2, 4, 5]
+    assert [row["step"] for row in rows] == [47, 49, 50]
+    assert all(np.isfinite(row["planner/loss"]) and row["planner/loss"] > 0 for row in rows)
+    assert ["planner/present_error_d2" in row for row in rows] == [False, True, True]
+    shown = capsys.readouterr().err
+    assert "planner: 100%" in shown and "5/5" in shown
+    make().learn(40, PlannerTrainingCallback())
+    assert "planner" not in capsys.readouterr().err
+
+
+# ---------------------------------------------------------------------------------------------------- cancelling
+
+
+def test_cancelling_early_keeps_the_weights(monkeypatch, capsys):
+    whole = make()
+    untrained = planner_of(whole)
+    interrupt_at(monkeypatch, 3, KeyboardInterrupt)
+    model = make().learn(40)
+    assert "interrupted after 3 of 6 updates" in capsys.readouterr().out
+    assert model.policy.planner_updates == 3 and differ(planner_of(model), untrained)
+    answers = [model.predict(model.env.reset(), deterministic=True)[0] for _ in range(2)]
+    assert np.isfinite(answers).all()
+    kept = planner_of(model)
+    file = io.BytesIO()
+    model.save(file)
+    assert_same(planner_of(SAID.load(file, device="cpu")), kept)
+
+
+def test_cancelling_before_the_first_update_keeps_an_earlier_planner(monkeypatch):
+    model = make().learn(40)
+    interrupt_at(monkeypatch, 0, KeyboardInterrupt)
+    model.train_planner()
+    assert model.policy.planner_is_trained and model.policy.planner_updates == 6
+
+
+def test_cancelling_one_of_several_trainings_does_not_end_learning(monkeypatch, trainings):
+    interrupt_at(monkeypatch, 2, KeyboardInterrupt)
+    model = make(planner_train_freq=40).learn(100)
+    assert begun(trainings) == [40, 80, 100] and list(trainings.values()) == [2, 6, 6]
+    assert model.num_timesteps == 100
+
+
+# ---------------------------------------------------------------------------------------------------- going on
+
+
+class Killed(Exception):
+    pass
+
+
+class Kill(BaseCallback):
+    def __init__(self, at):
+        super().__init__()
+        self.at = at
+
+    def _on_step(self):
+        if self.num_timesteps == self.at:
+            raise Killed
+        return True
+
+
+@pytest.mark.parametrize("killed_at", [1, 4, 5])
+def test_a_killed_training_ends_as_if_it_had_not_been_killed(tmp_path, monkeypatch, trainings, killed_at):
+    def callbacks(folder):
+        return [TrainingCheckpointCallback(folder, 30), PlannerTrainingCallback(folder=folder, save_interval=2)]
+
+    whole = make().learn(60, callbacks(tmp_path / "whole"))
+    interrupt_at(monkeypatch, killed_at, Killed())
+    with pytest.raises(Killed):
+        make().learn(60, callbacks(tmp_path / "killed"))
+    resumed = make()
+    untrained = planner_of(resumed)
+    restore_training(resumed, tmp_path / "killed" / "checkpoint.zip")
+    assert resumed.num_timesteps == 60 and not resumed.policy.planner_is_trained
+    trainings.clear()
+    resumed.learn(0, callbacks(tmp_path / "killed"), reset_num_timesteps=False)
+    assert list(trainings.values()) == [6 - killed_at // 2 * 2]  # from the last checkpoint, or from the start
+    assert_same(resumed.policy.state_dict(), whole.policy.state_dict())
+    assert differ(planner_of(resumed), untrained)
+
+
+@pytest.mark.parametrize("planner_first", [True, False])
+@pytest.mark.parametrize(("save_freq", "killed_at"), [(25, 60), (25, 50), (25, 85), (30, 55), (50, 99), (10, 101)])
+def test_a_resumed_run_loses_and_repeats_no_training(tmp_path, trainings, save_freq, killed_at, planner_first):
+    def callbacks():
+        both = [TrainingCheckpointCallback(tmp_path, save_freq), PlannerTrainingCallback(folder=tmp_path)]
+        return both[::-1] if planner_first else both
+
+    with pytest.raises(Killed):
+        make(planner_train_freq=50).learn(120, [*callbacks(), Kill(killed_at)])
+    before = begun(trainings)
+    assert before == [n for n in (50, 100) if n < killed_at]
+    resumed = make(planner_train_freq=50)
+    restore_training(resumed, tmp_path / "checkpoint.zip")
+    at = resumed.num_timesteps
+    trainings.clear()
+    resumed.learn(120 - at, callbacks(), reset_num_timesteps=False)
+    # What came after the checkpoint is made again, on the new data; a training at the checkpoint itself is in it
+    # or beside it, in the planner's own.
+    assert begun(trainings) == [n for n in (50, 100, 120) if n > at or (n == at and n not in before)]
+    assert resumed.policy.planner_updates == 6
+
+
+def test_a_checkpoint_of_other_data_is_not_gone_on_from(tmp_path, trainings):
+    callback = PlannerTrainingCallback(folder=tmp_path)
+    first = make().learn(40, callback)
+    make(seed=1).learn(40, PlannerTrainingCallback(folder=tmp_path))  # as many steps, but other ones
+    assert list(trainings.values()) == [6, 6]
+    second = make().learn(40, PlannerTrainingCallback(folder=tmp_path))
+    assert list(trainings.values()) == [6, 6, 6]
+    third = make().learn(40, PlannerTrainingCallback(folder=tmp_path))  # the very same: nothing is left to do
+    assert list(trainings.values()) == [6, 6, 6]
+    for again in (second, third):
+        assert_same(planner_of(again), planner_of(first))
+
+
+def test_a_checkpoint_of_other_settings_is_refused(tmp_path):
+    make().learn(40, PlannerTrainingCallback(folder=tmp_path))
+    with pytest.raises(ValueError, match="gradient_steps was 6 and is now 7"):
+        make(planner_gradient_steps=7).learn(40, PlannerTrainingCallback(folder=tmp_path))
+
+
+def test_a_checkpoint_that_does_not_name_its_data_is_gone_on_from(tmp_path, trainings):
+    make().learn(40, PlannerTrainingCallback(folder=tmp_path))
+    path = tmp_path / PLANNER_CHECKPOINT_NAME
+    old = {key: value for key, value in load_tree(path).items() if key != "replay"}
+    save_tree(path, old)
+    trainings.clear()
+    assert make().learn(40, PlannerTrainingCallback(folder=tmp_path)).policy.planner_updates == 6
+    assert not trainings

@@ -1,0 +1,449 @@
+"""SAID: an expert that learns as DelayedSAC does, a planner that answers, and files that bring back both."""
+
+import inspect
+import zipfile
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC, PlannerConfig
+
+PLANNER = {"d_model": 32, "depth": 1, "horizon": 3, "batch_size": 16, "sampling_steps": 2, "n_candidates": 4}
+
+
+class Drift(gym.Env):
+    """The state moves with the action; the reward is 1 - the first entry's square."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
+    action_space = spaces.Box(-2.0, 2.0, (1,), np.float32)
+
+    def __init__(self, length=12):
+        self.length = length
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t, self.state = 0, self.np_random.normal(size=2).astype(np.float32)
+        return self.state.copy(), {}
+
+    def step(self, action):
+        self.t += 1
+        self.state = (0.9 * self.state + 0.1 * np.array([action[0], self.state[0]])).astype(np.float32)
+        return self.state.copy(), 1.0 - float(self.state[0]) ** 2, False, self.t >= self.length, {}
+
+
+def delayed(delay=2, length=12, max_delay=None):
+    return DelayedObservationWrapper(Drift(length), delay, max_delay=max_delay)
+
+
+def make(env=None, cls=SAID, policy="MlpPolicy", planner_kwargs=(), **kwargs):
+    arguments = {"learning_starts": 20, "batch_size": 16, "buffer_size": 500, "seed": 0, "device": "cpu"}
+    arguments["policy_kwargs"] = {"net_arch": [32]}
+    if cls is SAID:
+        arguments |= {"planner_kwargs": PLANNER | dict(planner_kwargs), "planner_gradient_steps": 5}
+    return cls(policy, delayed() if env is None else env, **(arguments | kwargs))
+
+
+def observe(n=7, env=None):
+    """Return n observations of one episode, as a batch."""
+    env = delayed() if env is None else env
+    rows = [env.reset(seed=1)[0]]
+    rows += [env.step(np.array([0.3 * k - 1.0], np.float32))[0] for k in range(n - 1)]
+    return {key: np.stack([row[key] for row in rows]) for key in rows[0]}
+
+
+def rows_of(batch):
+    return [{key: value[i] for key, value in batch.items()} for i in range(len(batch["delay"]))]
+
+
+def answer(model, obs, deterministic=True):
+    return model.predict(obs, deterministic=deterministic)[0]
+
+
+@pytest.fixture(scope="module")
+def trained():
+    """A trained agent; tests must leave it as it is."""
+    return make().learn(80)
+
+
+@pytest.fixture
+def saved(trained, tmp_path):
+    trained.save(tmp_path / "said.zip")
+    return tmp_path / "said.zip"
+
+
+# ---------------------------------------------------------------------------------------------------- the expert
+
+
+def same_replay(first, second):
+    first, second = first.replay_buffer.state_dict(), second.replay_buffer.state_dict()
+    keys = ("observations", "actions", "rewards", "ages", "steps")
+    return all(np.array_equal(first[key], second[key]) for key in keys)
+
+
+@pytest.mark.parametrize("planner_train_freq", [None, 30])
+def test_the_expert_learns_and_acts_exactly_as_without_a_planner(planner_train_freq):
+    said = make(planner_train_freq=planner_train_freq).learn(100)
+    sac = make(cls=DelayedSAC).learn(100)
+    assert said.policy.planner_is_trained and said._n_updates == sac._n_updates == 80
+    assert same_replay(said, sac)  # collection never asked the planner
+    expected = sac.policy.state_dict()
+    th.testing.assert_close({key: said.policy.state_dict()[key] for key in expected}, expected, rtol=0, atol=0)
+    th.testing.assert_close(said.log_ent_coef, sac.log_ent_coef, rtol=0, atol=0)
+
+
+def test_the_expert_answers_until_the_planner_is_trained():
+    said, obs = make(), observe()
+    sac = make(cls=DelayedSAC)
+    np.testing.assert_allclose(answer(said, obs), answer(sac, obs), rtol=1e-5)
+    with pytest.raises(ValueError, match="not trained yet"), said.policy.answering("planner"):
+        pass
+    said.learn(60)
+    by_default = answer(said, obs)
+    with said.policy.answering("expert"):
+        by_expert = answer(said, obs)
+        with said.policy.answering("planner"):
+            assert np.array_equal(answer(said, obs), by_default)
+        assert np.array_equal(answer(said, obs), by_expert)
+    assert np.array_equal(answer(said, obs), by_default)
+    assert not np.allclose(by_default, by_expert)
+    with pytest.raises(ValueError, match="'nobody'"), said.policy.answering("nobody"):
+        pass
+
+
+class Asked(BaseCallback):
+    """Notes what predict answers at every step, and after the planner's training."""
+
+    def __init__(self, obs):
+        super().__init__()
+        self.obs, self.ours, self.experts = obs, [], []
+
+    def _on_step(self):
+        self.ours.append(answer(self.model, self.obs))
+        with self.model.policy.answering("expert"):
+            self.experts.append(answer(self.model, self.obs))
+        return True
+
+
+def test_callbacks_are_answered_by_the_expert_while_learning(trained, tmp_path):
+    evaluation, asked = EvalCallback(Monitor(delayed()), eval_freq=10, n_eval_episodes=2, verbose=0), Asked(observe())
+    model = make(planner_train_freq=30).learn(100, CallbackList([evaluation, asked]))
+    sac_evaluation = EvalCallback(Monitor(delayed()), eval_freq=10, n_eval_episodes=2, verbose=0)
+    make(cls=DelayedSAC).learn(100, sac_evaluation)
+    np.testing.assert_allclose(evaluation.evaluations_results, sac_evaluation.evaluations_results, rtol=1e-4)
+    assert np.array_equal(asked.ours, asked.experts)
+    assert not np.allclose(answer(model, asked.obs), asked.ours[-1])  # and by the planner afterwards
+
+
+# ---------------------------------------------------------------------------------------------------- the planner
+
+
+def test_value_is_the_smallest_critic(trained):
+    policy = trained.policy
+    states, actions = th.randn(3, 4, 5, 2), th.rand(3, 4, 5, 1) * 2 - 1
+    critics = policy.critic({"undelayed_observation": states.reshape(-1, 2)}, actions.reshape(-1, 1))
+    expected = th.minimum(*critics).reshape(3, 4, 5)
+    assert not th.equal(critics[0], critics[1])
+    th.testing.assert_close(policy.value(states, actions), expected)
+
+
+@pytest.mark.parametrize("delay", [0, 1, 2])
+def test_the_candidate_of_the_highest_value_after_the_decision_answers(trained, delay):
+    policy, planner = trained.policy, trained.policy.planner
+    obs = rows_of(observe())[delay]  # ages grow from 0 at an episode's start
+    assert obs["delay"] == delay
+    batch = {key: th.as_tensor(value[None]) for key, value in obs.items()}
+    ages = batch["delay"][:, 0].long()
+    plan = planner.plan(
+        batch["observation"], batch["action_history"], ages, value_fn=policy.value, noise=policy._fixed_noise()
+    )
+    assert plan.values.shape == (1, 4) and len(plan.values.unique()) > 1
+    futures = plan.states[0, :, delay + 1 :], plan.actions[0, :, delay + 1 :]
+    scores = th.minimum(
+        *(
+            th.stack([policy.critic({"undelayed_observation": s}, a)[i][:, 0] for s, a in zip(*futures, strict=True)])
+            for i in (0, 1)
+        )
+    ).mean(1)
+    th.testing.assert_close(plan.values[0], scores)
+    chosen = plan.actions[0, scores.argmax(), delay].numpy()
+    np.testing.assert_allclose(answer(trained, obs), 2.0 * chosen, rtol=1e-6)  # actions run from -2 to 2
+
+
+@pytest.mark.parametrize("who", ["planner", "expert"])
+def test_deterministic_answers_repeat_bit_for_bit(trained, saved, who):
+    loaded, batch = SAID.load(saved, device="cpu"), observe(9)
+    assert loaded.env is None
+    with trained.policy.answering(who), loaded.policy.answering(who):
+        states = th.get_rng_state(), np.random.get_state()[1].copy()
+        expected = answer(trained, batch)
+        assert th.equal(states[0], th.get_rng_state()) and np.array_equal(states[1], np.random.get_state()[1])
+        th.randn(3), answer(trained, batch, deterministic=False)
+        for model in (trained, loaded):
+            for size in (9, 4, 1):
+                parts = [{key: value[i : i + size] for key, value in batch.items()} for i in range(0, 9, size)]
+                assert np.array_equal(np.concatenate([answer(model, part) for part in parts]), expected)
+            assert np.array_equal([answer(model, row) for row in rows_of(batch)], expected)
+
+
+@pytest.mark.parametrize("who", ["planner", "expert"])
+def test_other_answers_follow_the_global_seed(trained, who):
+    obs = observe()
+    with trained.policy.answering(who):
+        answers = []
+        for seed in (1, 1, 2):
+            set_random_seed(seed)
+            answers.append(answer(trained, obs, deterministic=False))
+    assert np.array_equal(answers[0], answers[1])
+    assert not np.array_equal(answers[0], answers[2])
+    assert np.abs(answers[0]).max() <= 2.0
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("observation", [np.nan, 0.0], "observation has entries that are NaN"),
+        ("action_history", [[0.0], [np.nan]], "action_history has entries that are NaN"),
+        ("action_history", np.zeros((3, 1)), "another task or max_delay"),
+        ("observation", np.zeros(3), r"observation has the shape \(3,\)"),
+        ("delay", [3.0], "max_delay=2"),
+        ("delay", [-1.0], r"0\.\.2"),
+        ("delay", [0.5], "whole numbers"),
+    ],
+)
+def test_bad_observations_are_refused_before_planning(trained, key, value, message, deterministic, monkeypatch):
+    def computed(*_, **__):
+        raise AssertionError("the planner was asked")
+
+    monkeypatch.setattr(trained.policy.planner, "plan", computed)
+    obs = rows_of(observe())[3] | {key: np.asarray(value, np.float32)}
+    with pytest.raises(ValueError, match=message):
+        trained.predict(obs, deterministic=deterministic)
+
+
+def test_a_planner_for_one_age_refuses_others():
+    model = make(planner_kwargs={"mask": "fixed"}).learn(60)
+    assert answer(model, observe()).shape == (7, 1)  # ages 0 and 1 at an episode's start, then 2
+    fresher = observe(env=delayed(1, max_delay=2))
+    with pytest.raises(ValueError, match=r"age 2 only \(mask='fixed'\).*age 1.*mask='random'"):
+        model.predict(fresher)
+    with model.policy.answering("expert"):
+        assert answer(model, fresher).shape == (7, 1)
+
+
+# ---------------------------------------------------------------------------------------------------- settings
+
+
+def test_how_the_planner_answers_can_be_changed_and_is_saved(saved, tmp_path):
+    model, obs = SAID.load(saved, device="cpu"), observe()
+    before = answer(model, obs)
+    assert model.planner_kwargs == PLANNER
+    model.set_planner(temperature=3.0, n_candidates=9, sampling_steps=3)
+    assert not np.allclose(answer(model, obs), before)
+    model.set_planner(temperature=0.3)
+    changes = {"temperature": 0.3, "n_candidates": 9, "sampling_steps": 3}
+    assert model.planner_kwargs == model.policy.planner_kwargs == PLANNER | changes
+    model.save(tmp_path / "changed")
+    again = SAID.load(tmp_path / "changed", env=delayed(), device="cpu")
+    assert again.policy.planner.config == PlannerConfig(**PLANNER | changes)
+    assert np.array_equal(answer(again, obs), answer(model, obs))
+    model.set_planner(**{name: getattr(PlannerConfig(**PLANNER), name) for name in changes})
+    assert np.array_equal(answer(model, obs), before)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"depth": 2}, "got depth"),
+        ({"temperature": -1.0}, "temperature is -1"),
+        ({"n_candidates": 0}, "n_candidates is 0"),
+        ({"temprature": 0.5}, "got temprature"),
+        ({"solver": "euler"}, "solver"),
+    ],
+)
+def test_settings_that_cannot_be_changed_are_refused(saved, settings, message):
+    model = SAID.load(saved, device="cpu")
+    before = answer(model, observe())
+    with pytest.raises(ValueError, match=message):
+        model.set_planner(**settings)
+    assert model.planner_kwargs == PLANNER and np.array_equal(answer(model, observe()), before)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"planner_kwargs": {"dept": 2}}, "no setting dept; it has depth"),
+        ({"planner_kwargs": {"horizon": 1}}, "horizon is 1"),
+        ({"planner_gradient_steps": 0}, "planner_gradient_steps must be at least 1"),
+        ({"planner_train_freq": 0}, "planner_train_freq must be at least 1"),
+        ({"planner_newest_fraction": 0.0}, r"in \(0, 1\], got 0"),
+        ({"planner_newest_fraction": 1.5}, r"in \(0, 1\], got 1.5"),
+        ({"delay_reconciled_critic": False}, "must read true states"),
+    ],
+)
+def test_arguments_that_cannot_work_are_refused(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        make(**kwargs)
+
+
+def test_every_argument_has_a_default_and_is_an_attribute():
+    parameters = list(inspect.signature(SAID.__init__).parameters.values())[3:]
+    own = [p for p in parameters if p.kind is not p.VAR_KEYWORD]
+    given = {
+        "learning_rate": 0.01,
+        "planner_kwargs": PLANNER,
+        "planner_gradient_steps": 7,
+        "planner_train_freq": 9,
+        "planner_newest_fraction": 0.2,
+    }
+    assert [p.name for p in own] == list(given) and all(p.default is not p.empty for p in own)
+    model = make(**given)
+    assert {name: getattr(model, name) for name in given} == given
+    assert make(planner_kwargs={}).policy.planner.config.horizon == 3
+    assert SAID("MultiInputPolicy", delayed(), buffer_size=100).policy.planner.config == PlannerConfig()
+
+
+# ---------------------------------------------------------------------------------------------------- files
+
+
+def test_a_saved_agent_is_json_and_tensors(saved):
+    with zipfile.ZipFile(saved) as archive:
+        assert sorted(archive.namelist()) == ["metadata.json", "tensors.safetensors", "tree.json"]
+        content = b"".join(archive.read(name) for name in archive.namelist())
+    assert b":serialized:" not in content and b"cloudpickle" not in content
+    assert not content.startswith(b"\x80")
+
+
+def test_a_file_with_pickles_needs_an_opt_in(trained, tmp_path):
+    BaseAlgorithm.save(trained, tmp_path / "pickled")  # SB3's own
+    with pytest.raises(ValueError, match=r"runs whatever code.*allow_pickle=True"):
+        SAID.load(tmp_path / "pickled")
+    loaded = SAID.load(tmp_path / "pickled", device="cpu", allow_pickle=True)
+    assert np.array_equal(answer(loaded, observe()), answer(trained, observe()))
+
+
+def test_another_algorithms_file_is_refused(tmp_path):
+    make(cls=DelayedSAC).save(tmp_path / "sac")
+    with pytest.raises(ValueError, match="SAID needs a SAIDPolicy, got DelayedSACPolicy"):
+        SAID.load(tmp_path / "sac")
+
+
+def test_a_loaded_agent_learns_on(saved):
+    loaded = SAID.load(saved, env=make_vec_env(delayed, n_envs=2), device="cpu")
+    before = answer(loaded, observe())
+    loaded.learn(80, reset_num_timesteps=False)
+    assert loaded.num_timesteps == 160
+    assert not np.array_equal(answer(loaded, observe()), before)
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        SAID.load(saved, env=delayed(3))
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        loaded.set_env(make_vec_env(lambda: delayed(3), n_envs=2))
+
+
+def test_parameters_and_policy_are_taken_over(trained, tmp_path):
+    other, obs = make(seed=3), observe()
+    other.set_parameters(trained.get_parameters())
+    assert np.array_equal(answer(other, obs), answer(trained, obs))  # with the planner, and that it is trained
+    trained.policy.save(tmp_path / "policy")
+    policy = type(trained.policy).load(tmp_path / "policy", device="cpu")
+    assert np.array_equal(answer(policy, obs), answer(trained, obs))
+
+
+# ---------------------------------------------------------------------------------------------------- learning
+
+
+def test_training_the_planner_of_a_loaded_agent(trained, saved, tmp_path):
+    loaded = SAID.load(saved, device="cpu")
+    before = answer(loaded, observe())
+    with pytest.raises(ValueError, match="replay buffer is empty"):
+        loaded.train_planner()
+    assert np.array_equal(answer(loaded, observe()), before)
+    trained.save_replay_buffer(tmp_path / "replay")
+    loaded.load_replay_buffer(tmp_path / "replay")
+    loaded.train_planner(3)
+    assert loaded.policy.planner_updates == 3
+    assert not np.array_equal(answer(loaded, observe()), before)
+    with pytest.raises(ValueError, match="gradient_steps >= 1"):
+        loaded.train_planner(0)
+
+
+def test_learning_no_steps_changes_nothing(saved):
+    assert not make().learn(0).policy.planner_is_trained
+    loaded = SAID.load(saved, env=delayed(), device="cpu")
+    before = answer(loaded, observe())
+    for reset in (True, False):
+        loaded.learn(0, reset_num_timesteps=reset)
+        assert np.array_equal(answer(loaded, observe()), before)
+
+
+def test_one_unfinished_episode_is_enough_to_learn_from():
+    model = make(delayed(length=1000)).learn(40)
+    assert model.policy.planner_updates == 5
+    assert answer(model, observe()).shape == (7, 1)
+
+
+def test_a_plain_task_is_delay_0():
+    model = make("Pendulum-v1", policy="MultiInputPolicy").learn(60)
+    env = gym.make("Pendulum-v1")
+    obs = np.stack([env.reset(seed=k)[0] for k in range(3)])
+    actions = answer(model, obs)
+    assert actions.shape == (3, 1) and np.abs(actions).max() <= 2.0
+    assert np.array_equal(np.stack([answer(model, o) for o in obs]), actions)
+    assert not np.array_equal(answer(model, obs, deterministic=False), actions)
+    with pytest.raises(ValueError, match="NaN"):
+        model.predict(obs * np.nan)
+
+
+def test_evaluate_policy(trained):
+    env = Monitor(delayed())
+    env.reset(seed=0)
+    first = evaluate_policy(trained, env, n_eval_episodes=2, return_episode_rewards=True)[0]
+    env.reset(seed=0)
+    assert first == evaluate_policy(trained.policy, env, n_eval_episodes=2, return_episode_rewards=True)[0]
+    actions = []
+    for model in (trained, trained.policy):
+        evaluate_policy(model, env, 1, callback=lambda scope, _: actions.append(scope["actions"]))
+    assert len(actions) == 24 and all(a.shape == (1, 1) for a in actions)
+
+
+@pytest.mark.parametrize("env", [delayed, Drift])
+def test_normalized_tasks(env):
+    is_dict = env is delayed
+    vec_env = VecNormalize(
+        make_vec_env(env, n_envs=2, seed=0), norm_obs_keys=["observation"] if is_dict else None, gamma=0.9
+    )
+    model = make(vec_env).learn(120)
+    assert model.policy.planner_is_trained
+    assert answer(model, vec_env.reset()).shape == (2, 1)
+
+    # The planner's data are in the expert's units, the bootstrapped values in those of the stored rewards.
+    buffer, rms = model.replay_buffer, vec_env.obs_rms["observation"] if is_dict else vec_env.obs_rms
+    states = buffer.observations[: buffer.size()]
+    scaled = np.clip((states - rms.mean) / np.sqrt(rms.var + vec_env.epsilon), -10, 10)
+    source = model.make_planner_trainer().source
+    np.testing.assert_allclose(source.states[: buffer.size()], scaled, rtol=1e-4, atol=1e-6)
+    values = model._stored_values(states[:, 0], buffer.actions[: buffer.size(), 0])
+    with th.no_grad():
+        critic = model.policy.value(
+            th.as_tensor(scaled[:, 0], dtype=th.float32), th.as_tensor(buffer.actions[: len(states), 0])
+        )
+    np.testing.assert_allclose(values, critic * np.sqrt(vec_env.ret_rms.var + vec_env.epsilon), rtol=1e-4, atol=1e-5)
+
+
+def test_the_newest_part_of_the_buffer():
+    model = make(planner_newest_fraction=0.2, planner_kwargs={"weight_factor": 0.0}).learn(100)
+    trainer = model.make_planner_trainer()
+    assert trainer._settings["n_windows"] == 20
+    assert trainer.source.rows.min() >= 80
+    model.planner_newest_fraction = 1.0
+    assert model.make_planner_trainer()._settings["n_windows"] == 100
