@@ -18,6 +18,7 @@ from sb3_said.common.windows import Windows, WindowSource
 
 #: Key of the true state in ``info`` and in sampled observations; never part of an environment's observation space.
 UNDELAYED = "undelayed_observation"
+_ROW_ARRAYS = ("observations", "actions", "rewards", "dones", "timeouts", "ages", "steps", "tail_slots")
 
 
 @register_class
@@ -64,7 +65,7 @@ class DelayedReplayBuffer(ReplayBuffer):
         if self.buffer_size <= self.max_delay + 1:
             raise ValueError(
                 f"A buffer of {self.buffer_size} steps per environment cannot rebuild observations that are up to "
-                f"{self.max_delay} steps old; use a buffer_size above {(self.max_delay + 1) * n_envs}."
+                f"{self.max_delay} steps old; use a buffer_size of at least {(self.max_delay + 2) * n_envs}."
             )
         shape = (self.buffer_size, n_envs)
         self.observations = np.zeros((*shape, state_space.shape[0]), np.float32)
@@ -169,6 +170,13 @@ class DelayedReplayBuffer(ReplayBuffer):
             self.tail_states[slot] = self._next_states[env]
             self.tail_ages[slot] = self._next_ages[env]
 
+    def reset(self) -> None:
+        """Forget everything stored."""
+        super().reset()
+        self.tail_slots[:] = -1
+        self.tail_states, self.tail_ages, self._free_slots = self.tail_states[:0], self.tail_ages[:0], []
+        self._expected = None
+
     def _free(self, row: int) -> None:
         slots = self.tail_slots[row]
         self._free_slots.extend(slots[slots >= 0].tolist())
@@ -272,7 +280,7 @@ class DelayedReplayBuffer(ReplayBuffer):
         :param value_fn: (states (B, obs_dim), actions (B, act_dim)) -> (B,), bootstraps where an episode was cut off;
             without it an episode is taken to go on at its average reward
         :param env: normalises states, as the expert's observations are
-        :raises ValueError: when the buffer is empty or the fraction is not in (0, 1]
+        :raises ValueError: when the buffer is empty, the fraction is not in (0, 1], or gamma is 1 without ``value_fn``
         """
         if not 0.0 < newest_fraction <= 1.0:
             raise ValueError(f"newest_fraction is a part of the buffer in (0, 1], got {newest_fraction}.")
@@ -287,8 +295,10 @@ class DelayedReplayBuffer(ReplayBuffer):
 
         terminated = (self.dones[rows] * (1 - self.timeouts[rows])) > 0
         rewards = np.where(terminated, terminal_penalty, self.rewards[rows])
-        tails = average_reward_tail(rewards, ends, gamma)
-        if value_fn is not None:
+        if value_fn is None:
+            tails = average_reward_tail(rewards, ends, gamma)
+        else:
+            tails = np.zeros_like(rewards)
             t, e = np.nonzero(ends & ~terminated)
             tails[t, e] = value_fn(self.observations[rows[t], e], self.actions[rows[t], e])
         values = normalise_values(discounted_values(rewards, terminated, ends, tails, gamma))
@@ -305,7 +315,7 @@ class DelayedReplayBuffer(ReplayBuffer):
         return WindowSource(
             th.from_numpy(np.asarray(states, np.float32)),
             th.from_numpy(self.actions),
-            *(th.from_numpy(np.ascontiguousarray(x).reshape(-1)) for x in flat),
+            *(th.from_numpy(x.flatten()) for x in flat),  # a copy: the grid is read-only
         )
 
     def sample_windows(self, batch_size: int, length: int, generator: th.Generator | None = None) -> Windows:
@@ -320,8 +330,10 @@ class DelayedReplayBuffer(ReplayBuffer):
     # ------------------------------------------------------------------------------------------------ saving
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything stored, as arrays and numbers; unused rows are left out."""
-        names = ("observations", "actions", "rewards", "dones", "timeouts", "ages", "steps", "tail_slots")
+        """Return everything stored, as arrays and numbers; unused rows are left out.
+
+        The arrays are this buffer's own memory: write them out, or copy them, before adding on.
+        """
         return {
             "pos": self.pos,
             "full": self.full,
@@ -331,7 +343,7 @@ class DelayedReplayBuffer(ReplayBuffer):
             "next_ages": self._next_ages,
             "tail_states": self.tail_states,
             "tail_ages": self.tail_ages,
-            **{name: getattr(self, name)[: self.size()] for name in names},
+            **{name: getattr(self, name)[: self.size()] for name in _ROW_ARRAYS},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -341,18 +353,27 @@ class DelayedReplayBuffer(ReplayBuffer):
         """
         size = len(state["rewards"])
         fits = size == self.buffer_size if state["full"] else size == state["pos"] <= self.buffer_size
-        if not fits or state["observations"].shape[1:] != self.observations.shape[1:]:
+        fits = fits and all(state[name].shape[1:] == getattr(self, name).shape[1:] for name in _ROW_ARRAYS)
+        if not fits or not self._fits(state["expected"]):
             raise ValueError(
                 f"A stored replay of shape {state['observations'].shape} does not fit a buffer of shape "
-                f"{self.observations.shape}; use the buffer_size, n_envs and task it was made with."
+                f"{self.observations.shape}; use the buffer_size, n_envs, task and max_delay it was made with."
             )
         self.pos, self.full = state["pos"], state["full"]
         self._free_slots = state["free_slots"].tolist()
         self._expected = state["expected"]
         self._next_states, self._next_ages = state["next_states"].copy(), state["next_ages"].copy()
         self.tail_states, self.tail_ages = state["tail_states"].copy(), state["tail_ages"].copy()
-        for name in ("observations", "actions", "rewards", "dones", "timeouts", "ages", "steps", "tail_slots"):
+        for name in _ROW_ARRAYS:
             getattr(self, name)[:size] = state[name]
+        self.tail_slots[size:] = -1  # of whatever was stored before
+
+    def _fits(self, expected: dict[str, np.ndarray] | None) -> bool:
+        """Tell whether the observation that would continue a stored replay is of this buffer's task."""
+        space = self.observation_space
+        boxes = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
+        sizes = {key: self.n_envs * int(np.prod(box.shape)) for key, box in boxes.items()}  # type: ignore[arg-type]
+        return expected is None or {key: x.size for key, x in expected.items()} == sizes
 
 
 def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> tuple[spaces.Box, int]:

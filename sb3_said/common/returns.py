@@ -36,7 +36,10 @@ def average_reward_tail(rewards: np.ndarray, ends: np.ndarray, gamma: float) -> 
     :param ends: (T, n_envs) bool, the last stored step of each episode; true in the last row
     :param gamma: discount factor
     :return: (T, n_envs), read only where ``ends``
+    :raises ValueError: for gamma = 1, where going on for ever is worth no finite value
     """
+    if gamma >= 1.0:
+        raise ValueError(f"An episode that goes on has a finite value only with gamma < 1, got gamma={gamma}.")
     tails = np.zeros_like(rewards, dtype=np.float32)
     for env in range(rewards.shape[1]):
         last = np.flatnonzero(ends[:, env])

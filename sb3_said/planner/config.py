@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from sb3_said.planner import diffusion, dit, inpainting, normalizer, precision
 
-SCORED_STATES = ("future", "decision", "all")
+SCORED_STATES = ("future", "all")
 LR_SCHEDULES = ("cosine", "constant")
 
 

@@ -223,7 +223,7 @@ class InpaintingPlanner(nn.Module):
         """Return the mean value of each candidate's scored states: (B, N)."""
         if value_fn is None:
             return th.zeros(states.shape[:2], device=self.device)
-        first = {"future": delay + 1, "decision": delay, "all": th.ones_like(delay)}[self.config.scored_states]  # (B,)
+        first = 1 + delay if self.config.scored_states == "future" else th.ones_like(delay)  # (B,)
         skipped = int(first.min())  # states that no decision scores need no value
         values = value_fn(states[:, :, skipped:], actions[:, :, skipped:]).float()  # (B, N, L - skipped)
         if values.shape != (*states.shape[:2], states.shape[2] - skipped):

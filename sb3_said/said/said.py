@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -14,6 +14,8 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import configure_logger
 
+from sb3_said.common.save_util import load_algorithm_file
+from sb3_said.common.tree_file import PathOrFile
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.sac import DelayedSAC
 from sb3_said.said.callbacks import PlannerTrainingCallback
@@ -70,11 +72,36 @@ class SAID(DelayedSAC):
         self.planner_gradient_steps = planner_gradient_steps
         self.planner_train_freq = planner_train_freq
         self.planner_newest_fraction = planner_newest_fraction
+        self._planner_settings: dict[str, Any] = {}  # every field of the config, for files: defaults may change
         self._planner_trained_at = 0  # num_timesteps of the last planner training
         super().__init__(policy, env, learning_rate, **sac_kwargs)
 
     def _policy_flags(self) -> dict[str, Any]:
-        return {**super()._policy_flags(), "planner_kwargs": self.planner_kwargs}
+        return {**super()._policy_flags(), "planner_kwargs": {**self._planner_settings, **(self.planner_kwargs or {})}}
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self._planner_settings = asdict(self.policy.planner.config)
+
+    def set_parameters(
+        self,
+        load_path_or_dict: PathOrFile | dict[str, Any],
+        exact_match: bool = True,
+        device: th.device | str = "auto",
+        allow_pickle: bool = False,
+    ) -> None:
+        """As ``DelayedSAC``'s, but a planner that was never trained may be of other settings: it is not taken over."""
+        if not isinstance(load_path_or_dict, dict):
+            load_path_or_dict = load_algorithm_file(load_path_or_dict, device, None, allow_pickle, load_data=False)[1]
+        given, own = load_path_or_dict.get("policy", {}), self.policy.state_dict()
+        shapes = [
+            {name: value.shape for name, value in state.items() if name.startswith("planner.")}
+            for state in (given, own)
+        ]
+        if given.get("planner_updates") == 0 and shapes[0] != shapes[1]:
+            kept = {name: value for name, value in given.items() if not name.startswith("planner.")}
+            load_path_or_dict = {**load_path_or_dict, "policy": kept | {name: own[name] for name in shapes[1]}}
+        super().set_parameters(load_path_or_dict, exact_match, device)
 
     def learn(
         self: SelfSAID,
@@ -118,7 +145,8 @@ class SAID(DelayedSAC):
                 "give it as planner_kwargs of a new agent."
             )
         self.policy.planner.config = replace(self.policy.planner.config, **settings)
-        self.policy.planner_kwargs = self.planner_kwargs = {**self.policy.planner_kwargs, **settings}
+        self.planner_kwargs = {**(self.planner_kwargs or {}), **settings}
+        self.policy.planner_kwargs = {**self.policy.planner_kwargs, **settings}
 
     def make_planner_trainer(self, gradient_steps: int | None = None) -> PlannerTrainer:
         """Return a trainer of this agent's planner on its replay buffer.

@@ -230,6 +230,16 @@ def test_a_checkpoint_without_newer_entries_still_loads(tmp_path):
     assert model.learn(10, reset_num_timesteps=False).num_timesteps == 60
 
 
+def test_the_planner_may_change_until_it_is_trained(tmp_path):
+    path = run_and_kill(make(cls=SAID, planner_train_freq=None), tmp_path)
+    model = make(cls=SAID, planner_train_freq=None, planner_kwargs={**PLANNER, "depth": 2})
+    restore_training(model, path)
+    assert model.learn(20, reset_num_timesteps=False).policy.planner_updates == 4
+    other = run_and_kill(make(cls=SAID, planner_train_freq=40), tmp_path / "other")
+    with pytest.raises(ValueError, match="other networks"):
+        restore_training(make(cls=SAID, planner_kwargs={**PLANNER, "depth": 2}), other)
+
+
 @pytest.mark.parametrize(
     ("run", "resumed", "message"),
     [

@@ -2,6 +2,7 @@
 
 import inspect
 import zipfile
+from dataclasses import fields
 
 import gymnasium as gym
 import numpy as np
@@ -196,6 +197,15 @@ def test_deterministic_answers_repeat_bit_for_bit(trained, saved, who):
 
 
 @pytest.mark.parametrize("who", ["planner", "expert"])
+def test_the_batch_size_changes_no_bit(who):
+    # Wide enough for matrix products of several rows to round differently from those of one.
+    model = make(policy_kwargs={"net_arch": [256, 256]}, planner_kwargs={"d_model": 256, "n_candidates": 5}).learn(40)
+    batch = observe(12)
+    with model.policy.answering(who):
+        assert np.array_equal(answer(model, batch), [answer(model, row) for row in rows_of(batch)])
+
+
+@pytest.mark.parametrize("who", ["planner", "expert"])
 def test_other_answers_follow_the_global_seed(trained, who):
     obs = observe()
     with trained.policy.answering(who):
@@ -252,7 +262,7 @@ def test_how_the_planner_answers_can_be_changed_and_is_saved(saved, tmp_path):
     assert not np.allclose(answer(model, obs), before)
     model.set_planner(temperature=0.3)
     changes = {"temperature": 0.3, "n_candidates": 9, "sampling_steps": 3}
-    assert model.planner_kwargs == model.policy.planner_kwargs == PLANNER | changes
+    assert model.planner_kwargs == PLANNER | changes
     model.save(tmp_path / "changed")
     again = SAID.load(tmp_path / "changed", env=delayed(), device="cpu")
     assert again.policy.planner.config == PlannerConfig(**PLANNER | changes)
@@ -357,6 +367,30 @@ def test_parameters_and_policy_are_taken_over(trained, tmp_path):
     trained.policy.save(tmp_path / "policy")
     policy = type(trained.policy).load(tmp_path / "policy", device="cpu")
     assert np.array_equal(answer(policy, obs), answer(trained, obs))
+
+
+def test_a_file_brings_its_settings_whatever_the_defaults_are_then(trained, saved, monkeypatch):
+    expected, names = trained.policy.planner.config, [field.name for field in fields(PlannerConfig)]
+    defaults = list(PlannerConfig.__init__.__defaults__)
+    others = {"scored_states": "all", "solver": "dpmsolver++2m", "embed_known": False}
+    for name, value in others.items():
+        assert getattr(expected, name) == defaults[names.index(name)] != value
+        defaults[names.index(name)] = value
+    monkeypatch.setattr(PlannerConfig.__init__, "__defaults__", tuple(defaults))
+    assert PlannerConfig().solver == "dpmsolver++2m"
+    loaded = SAID.load(saved, device="cpu")
+    assert loaded.policy.planner.config == expected
+    assert np.array_equal(answer(loaded, observe()), answer(trained, observe()))
+
+
+def test_only_an_untrained_planner_may_be_of_other_settings(trained, tmp_path):
+    expert, deeper = make(seed=4), make(planner_kwargs={"depth": 2})
+    expert.save(tmp_path / "expert")
+    deeper.set_parameters(tmp_path / "expert")
+    assert np.array_equal(answer(deeper, observe()), answer(expert, observe()))
+    assert len(deeper.policy.planner.network.blocks) == 2
+    with pytest.raises(RuntimeError, match="planner"):
+        deeper.set_parameters(trained.get_parameters())
 
 
 # ---------------------------------------------------------------------------------------------------- learning
