@@ -12,8 +12,8 @@ from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_said.common.registry import register_class
 from sb3_said.common.returns import average_reward_tail, discounted_values, normalise_values
-from sb3_said.common.save_util import register_class
 from sb3_said.common.windows import Windows, WindowSource
 
 #: Key of the true state in ``info`` and in sampled observations; never part of an environment's observation space.
@@ -162,7 +162,8 @@ class DelayedReplayBuffer(ReplayBuffer):
             if not self._free_slots:
                 n_slots = len(self.tail_ages)
                 n_new = max(n_slots, 64)
-                self.tail_states = np.concatenate([self.tail_states, np.zeros((n_new, self.tail_states.shape[1]), np.float32)])
+                new_states = np.zeros((n_new, self.tail_states.shape[1]), np.float32)
+                self.tail_states = np.concatenate([self.tail_states, new_states])
                 self.tail_ages = np.concatenate([self.tail_ages, np.zeros(n_new, np.int16)])
                 self._free_slots = list(range(n_slots + n_new - 1, n_slots - 1, -1))
             slot = self._free_slots.pop()

@@ -6,12 +6,12 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
-from sb3_said.common.save_util import register_class
+from sb3_said.common.registry import register_class
 
 
 @register_class
 class StateAugmentedExtractor(BaseFeaturesExtractor):
-    """Concatenate [delayed observation, action history, age / D], with which the process is Markov (paper, Theorem 2.1).
+    """Concatenate [delayed observation, action history, age / D], which make the process Markov (paper, Theorem 2.1).
 
     :param observation_space: that of ``DelayedObservationWrapper``
     """

@@ -24,7 +24,8 @@ def discounted_values(
     values = np.empty_like(rewards, dtype=np.float32)
     following = np.zeros(rewards.shape[1], dtype=np.float64)
     for t in range(len(rewards) - 1, -1, -1):
-        following = np.where(ends[t], np.where(terminated[t], rewards[t], tail_values[t]), rewards[t] + gamma * following)
+        last = np.where(terminated[t], rewards[t], tail_values[t])
+        following = np.where(ends[t], last, rewards[t] + gamma * following)
         values[t] = following
     return values
 

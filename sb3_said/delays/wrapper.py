@@ -102,9 +102,7 @@ class DelayedObservationWrapper(
         self._history[:] = 0.0
         return self._observe(state), self._with_state(info)
 
-    def step(
-        self, action: np.ndarray
-    ) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict[str, Any]]:
         """Execute the action now; observe what has arrived.
 
         :param action: (act_dim,), in the units of the action space

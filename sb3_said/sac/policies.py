@@ -13,7 +13,7 @@ from stable_baselines3.sac.policies import Actor, ContinuousCritic, SACPolicy
 
 from sb3_said.common.buffers import UNDELAYED, check_spaces
 from sb3_said.common.extractors import KeyExtractor, StateAugmentedExtractor
-from sb3_said.common.save_util import register_class
+from sb3_said.common.registry import register_class
 
 
 @register_class

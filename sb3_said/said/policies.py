@@ -12,7 +12,7 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_said.common.buffers import UNDELAYED, check_spaces
-from sb3_said.common.save_util import register_class
+from sb3_said.common.registry import register_class
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.sac.policies import DelayedSACPolicy
 

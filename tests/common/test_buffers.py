@@ -1,4 +1,4 @@
-"""The replay: what it samples is what a store of whole transitions would, bit for bit, at the memory of states alone."""
+"""The replay: it samples what a store of whole transitions would, bit for bit, at the memory of states alone."""
 
 import copy
 from dataclasses import replace
@@ -51,7 +51,8 @@ def assert_same_samples(first, second, batch_size=500, **kwargs):
 
 def naive_transition(row: Row, env: int, max_delay: int) -> dict[str, np.ndarray]:
     arrays = {}
-    for name, obs, states in [("observations", row.obs, row.states), ("next_observations", row.next_obs, row.next_states)]:
+    before, after = ("observations", row.obs, row.states), ("next_observations", row.next_obs, row.next_states)
+    for name, obs, states in (before, after):
         arrays.update({f"{name}/{key}": x[env] for key, x in obs.items()})
         arrays[f"{name}/{UNDELAYED}"] = states[env]
     executed = row.next_obs["action_history"][env, -1] if max_delay > 0 else row.action[env]
@@ -147,6 +148,17 @@ def test_an_interruption_neither_ends_an_episode_nor_joins_two():
     assert buffer.window_source().remaining.tolist() == [5, 4, 3, 2, 1] * 2
 
 
+def test_an_end_is_an_end_though_the_next_episode_starts_where_it_ended():
+    player = Player(n_envs=1, delay=None)
+    buffer = make_buffer(player)
+    state = np.ones((1, OBS_DIM), np.float32)
+    for t in range(6):
+        done = np.array([t % 3 == 2])
+        buffer.add(state, state, np.zeros((1, ACT_DIM)), np.zeros(1), done, [{}])
+    assert buffer.window_source().remaining.tolist() == [3, 2, 1, 3, 2, 1]
+    assert buffer.steps[:6, 0].tolist() == [0, 1, 2, 0, 1, 2]
+
+
 def test_each_environment_has_its_own_episodes():
     player = Player(n_envs=3, delay=(0, 4), max_length=8)
     rows = player.play(200)
@@ -169,7 +181,8 @@ def test_delay_zero_has_empty_histories():
     buffer = fill(make_buffer(player), rows)
     assert_exact(buffer, rows)
     batch = buffer.sample(7)
-    assert batch.observations["action_history"].shape == batch.next_observations["action_history"].shape == (7, 0, ACT_DIM)
+    for observations in (batch.observations, batch.next_observations):
+        assert observations["action_history"].shape == (7, 0, ACT_DIM)
     np.testing.assert_array_equal(batch.observations["observation"], batch.observations[UNDELAYED])
 
 
@@ -390,7 +403,9 @@ OTHER_BUFFERS = {
 
 def delayed_space(obs_dim, act_dim):
     return spaces.Dict(
-        observation=spaces.Box(-1, 1, (obs_dim,)), action_history=spaces.Box(-1, 1, (2, act_dim)), delay=spaces.Box(0, 2, (1,))
+        observation=spaces.Box(-1, 1, (obs_dim,)),
+        action_history=spaces.Box(-1, 1, (2, act_dim)),
+        delay=spaces.Box(0, 2, (1,)),
     )
 
 

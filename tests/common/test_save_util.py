@@ -29,13 +29,13 @@ from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, Line
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_said.common import save_util, tree_file
+from sb3_said.common import registry, tree_file
+from sb3_said.common.registry import register_class
 from sb3_said.common.save_util import (
     SafeSaveMixin,
     load_algorithm_file,
     load_metadata,
     load_tree,
-    register_class,
     save_algorithm,
     save_tree,
 )
@@ -419,10 +419,10 @@ def test_a_newer_format_is_refused(tmp_path, monkeypatch):
 
 
 def space_trip(value):
-    encoder = save_util._ObjectEncoder()
+    encoder = registry.ObjectEncoder()
     node = json.loads(json.dumps(encoder.encode(value, "value")))
     blobs = {name: np.frombuffer(tree_file._bytes_of(blob), np.uint8).copy() for name, blob in encoder.blobs.items()}
-    return save_util._ObjectDecoder(blobs).decode(node)
+    return registry.ObjectDecoder(blobs).decode(node)
 
 
 @pytest.mark.parametrize(
@@ -651,8 +651,8 @@ def test_policies_and_their_arguments_can_be_supplied(tmp_path):
 
 
 def test_registered_classes_load_only_while_registered(tmp_path, monkeypatch):
-    monkeypatch.setattr(save_util, "_CLASS_OF_NAME", dict(save_util._CLASS_OF_NAME))
-    monkeypatch.setattr(save_util, "_NAME_OF_CLASS", dict(save_util._NAME_OF_CLASS))
+    monkeypatch.setattr(registry, "_CLASS_OF_NAME", dict(registry._CLASS_OF_NAME))
+    monkeypatch.setattr(registry, "_NAME_OF_CLASS", dict(registry._NAME_OF_CLASS))
 
     @register_class
     class OwnPolicy(SACPolicy):
@@ -660,8 +660,8 @@ def test_registered_classes_load_only_while_registered(tmp_path, monkeypatch):
 
     make_sac(policy=OwnPolicy).save(tmp_path / "agent")
     assert type(SafeSAC.load(tmp_path / "agent", device="cpu").policy) is OwnPolicy
-    name = save_util._NAME_OF_CLASS[OwnPolicy]
-    del save_util._CLASS_OF_NAME[name]
+    name = registry._NAME_OF_CLASS[OwnPolicy]
+    del registry._CLASS_OF_NAME[name]
     with pytest.raises(ValueError, match=r"OwnPolicy', which is not registered.*register_class"):
         SafeSAC.load(tmp_path / "agent", device="cpu")
     supplied = {"policy_class": OwnPolicy}

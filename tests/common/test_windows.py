@@ -204,7 +204,7 @@ def test_split_by_whole_episodes(lengths, held_out, seed):
     for part, numbers in zip((training, validation), parts, strict=True):
         assert len(part) == sum(lengths[i] for i in numbers)
         assert part.start_states()[:, 0].tolist() == part.episodes.tolist()  # every column is cut alike
-        assert th.equal(part.start_states()[:, 1], part.values * max(lengths))
+        th.testing.assert_close(part.start_states()[:, 1], part.values * max(lengths))
         assert th.equal(part.remaining, th.tensor(lengths)[part.episodes] - part.start_states()[:, 1].long())
         assert part.states is source.states  # not copied
     # As many as asked for, and no episode more than needed; one is always left for training
