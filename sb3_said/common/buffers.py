@@ -87,7 +87,7 @@ class DelayedReplayBuffer(ReplayBuffer):
 
     # ------------------------------------------------------------------------------------------------ writing
 
-    def add(  # type: ignore[override]
+    def add(
         self,
         obs: np.ndarray | dict[str, np.ndarray],
         next_obs: np.ndarray | dict[str, np.ndarray],
@@ -185,7 +185,9 @@ class DelayedReplayBuffer(ReplayBuffer):
 
     # ------------------------------------------------------------------------------------------------ sampling
 
-    def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
+    def sample(  # type: ignore[override]
+        self, batch_size: int, env: VecNormalize | None = None
+    ) -> ReplayBufferSamples | DictReplayBufferSamples:
         """Sample transitions uniformly, except the few oldest whose past has been overwritten.
 
         :param batch_size: B
@@ -258,7 +260,7 @@ class DelayedReplayBuffer(ReplayBuffer):
     ) -> dict[str, th.Tensor]:
         if env is not None:
             states = env.normalize_obs({**obs, "observation": states})["observation"]
-            obs = env.normalize_obs(obs)
+            obs = env.normalize_obs(obs)  # type: ignore[assignment]  # a dict for a dict
         return {key: self.to_torch(value) for key, value in {**obs, UNDELAYED: states}.items()}
 
     # ------------------------------------------------------------------------------------------------ windows
@@ -309,7 +311,7 @@ class DelayedReplayBuffer(ReplayBuffer):
             raw = {key: np.zeros((1, *space.shape), np.float32) for key, space in self.observation_space.items()}  # type: ignore[attr-defined]
             states = env.normalize_obs({**raw, "observation": states})["observation"]
         elif env is not None:
-            states = env.normalize_obs(states)
+            states = env.normalize_obs(states)  # type: ignore[assignment]  # an array for an array
         episodes = last + np.arange(self.n_envs) * n_rows  # unique for each environment and end
         grid = np.broadcast_to(rows[:, None], ends.shape), np.broadcast_to(np.arange(self.n_envs), ends.shape)
         flat = (*grid, last - np.arange(n_rows)[:, None] + 1, values, episodes)

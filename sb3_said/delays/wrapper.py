@@ -12,6 +12,10 @@ from gymnasium import spaces
 from sb3_said.delays.processes import DelayProcess, make_process
 
 
+#: Keeps the delays' random numbers apart from those that the task draws from the same seed.
+DELAY_STREAM = 1
+
+
 class DelayedObservationWrapper(
     gym.Wrapper[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray], gym.utils.RecordConstructorArgs
 ):
@@ -63,6 +67,11 @@ class DelayedObservationWrapper(
                 f"DelayedObservationWrapper needs a bounded 1-D Box action, got {act_space}; "
                 "put gymnasium.wrappers.RescaleAction below it."
             )
+        if not np.all(act_space.low < act_space.high):
+            raise ValueError(
+                f"DelayedObservationWrapper scales actions by their bounds, but low and high are equal in {act_space}; "
+                "leave out the action entries that cannot vary."
+            )
         self.process = make_process(delay)
         self.max_delay = self.process.max_delay if max_delay is None else max_delay
         if self.max_delay < self.process.max_delay:
@@ -72,7 +81,7 @@ class DelayedObservationWrapper(
         self._action_is_scaled = bool(np.all(act_space.low == -1) and np.all(act_space.high == 1))
         with np.errstate(over="ignore"):  # a float64 bound beyond float32 becomes infinite
             low, high = (bound.astype(np.float32) for bound in (obs_space.low, obs_space.high))
-        self.observation_space = spaces.Dict(
+        self.observation_space = spaces.Dict(  # type: ignore[assignment]  # a Dict is a Space[dict[str, Any]]
             observation=spaces.Box(low, high, dtype=np.float32),
             action_history=spaces.Box(-1.0, 1.0, (self.max_delay, *act_space.shape), np.float32),
             delay=spaces.Box(0.0, float(self.max_delay), (1,), np.float32),
@@ -91,9 +100,10 @@ class DelayedObservationWrapper(
         :param seed: seeds the task and the delay process
         :raises ValueError: when the process draws a delay outside 0..D
         """
+        state: Any
         state, info = self.env.reset(seed=seed, options=options)
         if seed is not None:
-            self._rng = np.random.default_rng(seed)
+            self._rng = np.random.default_rng([seed, DELAY_STREAM])
         self._delay = self.process.sample(self._rng)
         if not 0 <= self._delay <= self.max_delay:
             raise ValueError(f"{self.process!r} drew a delay of {self._delay}, outside 0..{self.max_delay}.")
@@ -107,6 +117,7 @@ class DelayedObservationWrapper(
 
         :param action: (act_dim,), in the units of the action space
         """
+        state: Any
         state, reward, terminated, truncated, info = self.env.step(action)
         if self.max_delay > 0:
             self._history[:-1] = self._history[1:]

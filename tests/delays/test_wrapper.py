@@ -251,3 +251,10 @@ def test_a_process_outside_its_range_is_refused(draw):
 
 def test_fixed_process_equals_integer():
     assert DelayedObservationWrapper(LoggedTask(), 6).process == FixedDelay(6)
+
+
+def test_an_action_that_cannot_vary_is_refused():
+    env = gym.make("Pendulum-v1")
+    env.action_space = spaces.Box(np.float32([-1.0, 0.5]), np.float32([1.0, 0.5]))
+    with pytest.raises(ValueError, match="low and high are equal"):
+        DelayedObservationWrapper(env, delay=1)
