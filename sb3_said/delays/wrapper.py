@@ -11,7 +11,6 @@ from gymnasium import spaces
 
 from sb3_said.delays.processes import DelayProcess, make_process
 
-
 #: Keeps the delays' random numbers apart from those that the task draws from the same seed.
 DELAY_STREAM = 1
 
