@@ -63,7 +63,11 @@ class DiTBlock(nn.Module):
 
     def _attention(self, x: th.Tensor, attend: th.Tensor | None) -> th.Tensor:
         q, k, v = self.qkv(x).unflatten(-1, (3, -1, HEAD_DIM)).permute(2, 0, 3, 1, 4)  # each (M, heads, L, HEAD_DIM)
-        mixed = F.scaled_dot_product_attention(q, k, v, attn_mask=attend)
+        # Plain products: windows are short, and the fused kernel's backward pass on CPUs costs more than all else.
+        scores = (q * HEAD_DIM**-0.5) @ k.transpose(-1, -2)  # (M, heads, L, L)
+        if attend is not None:
+            scores = scores.masked_fill(~attend, -th.inf)
+        mixed = scores.softmax(-1).to(v.dtype) @ v  # (M, heads, L, HEAD_DIM)
         return self.attention_out(mixed.transpose(1, 2).flatten(2))
 
 
