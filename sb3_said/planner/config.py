@@ -6,8 +6,10 @@ from dataclasses import dataclass, replace
 
 from sb3_said.planner import diffusion, dit, inpainting, normalizer, precision
 
-SCORED_STATES = ("future", "all")
+SCORED_STATES = ("future", "decision", "all")
 LR_SCHEDULES = ("cosine", "constant")
+#: Settings that shape a planner's answers and none of its weights.
+SAMPLING_SETTINGS = ("solver", "time_grid", "sampling_steps", "n_candidates", "temperature", "scored_states")
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,9 @@ class PlannerConfig:
     sampling_steps: int = 5  # 99.6 % of the paper's return with 20
     n_candidates: int = 16  # measured; the paper's 50 cost three times as much
     temperature: float = 0.5  # measured; factor on the initial noise, >= 0; the paper tunes 0.1 to 1 per task
-    scored_states: str = "future"  # measured: states after the decision index; or "all" but the first (paper)
+    # "future": states after the decision index (measured); "decision": the decision alone, at the present that the
+    # candidates agree on, so that only actions compete and not beliefs; "all": all states but the first (paper)
+    scored_states: str = "future"
     # Training
     learning_rate: float = 2e-3  # measured at depth 2, together with the warm-up
     lr_schedule: str = "cosine"  # paper: down to 0; or "constant"

@@ -223,7 +223,12 @@ class InpaintingPlanner(nn.Module):
         """Return the mean value of each candidate's scored states: (B, N)."""
         if value_fn is None:
             return th.zeros(states.shape[:2], device=self.device)
-        first = 1 + delay if self.config.scored_states == "future" else th.ones_like(delay)  # (B,)
+        if self.config.scored_states == "decision":
+            rows = th.arange(len(delay), device=self.device)
+            present = states[rows, :, delay].mean(1, keepdim=True).expand(-1, states.shape[1], -1)  # (B, N, obs_dim)
+            states, actions = present[:, :, None], actions[rows, :, delay][:, :, None]  # windows of one step
+            delay = th.full_like(delay, -1)  # so that the one step counts as behind the decision index
+        first = th.ones_like(delay) if self.config.scored_states == "all" else 1 + delay  # (B,)
         skipped = int(first.min())  # states that no decision scores need no value
         values = value_fn(states[:, :, skipped:], actions[:, :, skipped:]).float()  # (B, N, L - skipped)
         if values.shape != (*states.shape[:2], states.shape[2] - skipped):

@@ -11,7 +11,7 @@ from typing import Any
 import torch as th
 
 from sb3_said.common.windows import Windows, WindowSource
-from sb3_said.planner.config import PlannerConfig
+from sb3_said.planner.config import SAMPLING_SETTINGS, PlannerConfig
 from sb3_said.planner.inpainting import draw_delays
 from sb3_said.planner.planner import InpaintingPlanner
 from sb3_said.planner.yardstick import Present, RegressionYardstick
@@ -239,8 +239,8 @@ class PlannerTrainer:
 
         :raises ValueError: when that training had other settings, so that the end would be neither's
         """
-        if state["settings"] != self._settings:
-            saved, given = _flat(state["settings"]), _flat(self._settings)
+        saved, given = _flat(state["settings"]), _flat(self._settings)
+        if saved != given:
             differing = [key for key in sorted(saved | given) if saved.get(key) != given.get(key)]
             raise ValueError(
                 "Training can only resume with the settings and data it began with, but these differ: "
@@ -311,7 +311,9 @@ def _plain(tree: Any) -> Any:
 
 
 def _flat(settings: dict[str, Any]) -> dict[str, Any]:
-    return {**{key: value for key, value in settings.items() if key != "config"}, **settings["config"]}
+    """Return the settings that decide the weights, in one dict."""
+    config = {key: value for key, value in settings["config"].items() if key not in SAMPLING_SETTINGS}
+    return {**{key: value for key, value in settings.items() if key != "config"}, **config}
 
 
 def _optimizer_state(optimizer: th.optim.Optimizer) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields
@@ -17,9 +18,6 @@ from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.sac.policies import DelayedSACPolicy
 
 Answer = Literal["planner", "expert"]
-
-#: Seed of the candidates' noise when ``deterministic=True``. Any number does; changing it changes every answer.
-NOISE_SEED = 0
 
 
 @register_class
@@ -103,8 +101,7 @@ class SAIDPolicy(DelayedSACPolicy):
         # Each row alone: matrix products of another batch size round differently, and can change the candidate chosen.
         if who == "expert":
             return th.cat([super(SAIDPolicy, self)._predict(row, True) for row in _rows(observation)])
-        noise = self._fixed_noise()
-        return th.cat([self._plan(row, noise) for row in _rows(observation)])
+        return th.cat([self._plan(row, self._noise_of(row)) for row in _rows(observation)])
 
     def _plan(self, observation: PyTorchObs, noise: th.Tensor | None = None) -> th.Tensor:
         """Return the decision of each row: (B, act_dim)."""
@@ -127,11 +124,17 @@ class SAIDPolicy(DelayedSACPolicy):
             delay = th.full_like(delay, self.max_delay)
         return self.planner.plan(states, history, delay, value_fn=self.value, noise=noise).action
 
-    def _fixed_noise(self) -> th.Tensor:
-        """Return the same noise at every call, without touching the global random state: (N, L, obs_dim + act_dim)."""
+    def _noise_of(self, row: PyTorchObs) -> th.Tensor:
+        """Return noise that the observation alone decides: (N, L, obs_dim + act_dim).
+
+        It repeats where the observation does, and leaves the global random state alone. One noise for all observations
+        would favour the same few candidates at every step, and their errors would add up.
+        """
         planner = self.planner
+        entries = [row[key] for key in sorted(row)] if isinstance(row, dict) else [row]
+        seed = zlib.crc32(b"".join(entry.cpu().numpy().tobytes() for entry in entries))
         shape = (planner.config.n_candidates, planner.window_length, planner.obs_dim + planner.act_dim)
-        return th.randn(shape, generator=th.Generator().manual_seed(NOISE_SEED))
+        return th.randn(shape, generator=th.Generator().manual_seed(seed))
 
     def set_training_mode(self, mode: bool) -> None:
         super().set_training_mode(mode)

@@ -16,13 +16,12 @@ from stable_baselines3.common.utils import configure_logger
 
 from sb3_said.common.save_util import load_algorithm_file
 from sb3_said.common.tree_file import PathOrFile
+from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.sac import DelayedSAC
 from sb3_said.said.callbacks import PlannerTrainingCallback
 from sb3_said.said.policies import SAIDPolicy
 
-#: Planner settings that shape its answers and none of its weights.
-SAMPLING_SETTINGS = ("solver", "time_grid", "sampling_steps", "n_candidates", "temperature", "scored_states")
 HELD_OUT = 0.05  # of the planner's data, in whole episodes
 
 SelfSAID = TypeVar("SelfSAID", bound="SAID")

@@ -519,3 +519,21 @@ def test_loss_and_normaliser_refuse():
         planner.fit_normalizer(th.zeros(4, OBS), th.zeros(5, ACT))
     with pytest.raises(ValueError, match="obs_dim, act_dim and max_delay are 3, 0 and -1"):
         InpaintingPlanner(3, 0, -1)
+
+
+def test_the_decision_alone_is_scored_at_the_present_that_all_candidates_share():
+    planner = make_planner(scored_states="decision", n_candidates=5)
+    observation, history, delay = make_batch(6)
+    seen = []
+
+    def value_fn(states, actions):
+        seen.append((states, actions))
+        return states.sum(-1) + actions[..., 0]
+
+    plan = planner.plan(observation, history, delay, value_fn=value_fn, generator=seeded())
+    (states, actions), rows = seen[0], th.arange(6)
+    present, decisions = plan.states[rows, :, delay].mean(1), plan.actions[rows, :, delay]  # (6, OBS), (6, 5, ACT)
+    th.testing.assert_close(states, present[:, None, None].expand(6, 5, 1, OBS))
+    th.testing.assert_close(actions, decisions[:, :, None])
+    best = decisions[..., 0].argmax(1)  # the present is the same for all, so the actions decide
+    assert th.equal(plan.action, decisions[rows, best]) and len(set(best.tolist())) > 1

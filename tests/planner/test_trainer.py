@@ -265,3 +265,10 @@ def test_data_of_other_sizes():
     planner = InpaintingPlanner(STATE_DIM + 1, ACTION_DIM, D, PlannerConfig(depth=1, d_model=32))
     with pytest.raises(ValueError, match=r"expects 3 observation .* have 2"):
         PlannerTrainer(planner, make_source(10, 10), 10)
+
+
+def test_training_resumes_under_other_sampling_settings():
+    first, second = make_trainer(), make_trainer(temperature=0.1, n_candidates=3, scored_states="decision")
+    first.train(3)
+    second.load_state_dict(first.state_dict())
+    assert second.n_updates == 3

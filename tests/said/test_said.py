@@ -165,7 +165,7 @@ def test_the_candidate_of_the_highest_value_after_the_decision_answers(trained, 
     batch = {key: th.as_tensor(value[None]) for key, value in obs.items()}
     ages = batch["delay"][:, 0].long()
     plan = planner.plan(
-        batch["observation"], batch["action_history"], ages, value_fn=policy.value, noise=policy._fixed_noise()
+        batch["observation"], batch["action_history"], ages, value_fn=policy.value, noise=policy._noise_of(batch)
     )
     assert plan.values.shape == (1, 4) and len(plan.values.unique()) > 1
     futures = plan.states[0, :, delay + 1 :], plan.actions[0, :, delay + 1 :]
@@ -177,7 +177,20 @@ def test_the_candidate_of_the_highest_value_after_the_decision_answers(trained, 
     ).mean(1)
     th.testing.assert_close(plan.values[0], scores)
     chosen = plan.actions[0, scores.argmax(), delay].numpy()
-    np.testing.assert_allclose(answer(trained, obs), 2.0 * chosen, rtol=1e-6)  # actions run from -2 to 2
+    np.testing.assert_allclose(answer(trained, obs), 2.0 * chosen, rtol=1e-6, atol=1e-6)  # actions run from -2 to 2
+
+
+def test_deterministic_noise_is_the_observations_own(trained):
+    # One noise for every observation makes the same candidates win at every step: on Hopper-v5 an agent of return 3,000
+    # fell to 351 with it.
+    policy = trained.policy
+    rows = [{key: th.as_tensor(value[None]) for key, value in row.items()} for row in rows_of(observe(4))]
+    noises = [policy._noise_of(row) for row in rows]
+    assert all(not th.equal(noises[0], other) for other in noises[1:])
+    before = th.get_rng_state()
+    shuffled = dict(reversed(rows[0].items()))
+    assert th.equal(policy._noise_of(shuffled), noises[0]) and th.equal(th.get_rng_state(), before)
+    assert abs(th.cat([n.flatten() for n in noises]).std() - 1) < 0.1
 
 
 @pytest.mark.parametrize("who", ["planner", "expert"])
