@@ -169,13 +169,22 @@ class DelayedExperimentManager(ExperimentManager):
 
     def _logger(self, model: BaseAlgorithm) -> Logger:
         """Log to the screen, to progress.csv (one file per resume) and to TensorBoard if asked for."""
-        suffix = f"_{model.num_timesteps}" if model.num_timesteps > 0 else ""
-        formats = [make_output_format("csv", self.save_path, suffix)]
+        formats = [make_output_format("csv", self.save_path, log_suffix(Path(self.save_path), model.num_timesteps))]
         if self.verbose > 0:
             formats.append(make_output_format("stdout", self.save_path))
         if self.tensorboard_log is not None:
             formats.append(make_output_format("tensorboard", f"{self.tensorboard_log}/{Path(self.save_path).name}"))
         return Logger(self.save_path, formats)
+
+
+def log_suffix(folder: Path, steps: int) -> str:
+    """Return what follows ``progress`` in the name of a log that starts now, so that no earlier one is overwritten.
+
+    :param folder: of the run
+    :param steps: environment steps the run has taken
+    """
+    names = ["" if steps == 0 else f"_{steps}", *(f"_{steps}_{k}" for k in range(2, 1000))]
+    return next(name for name in names if not (folder / f"progress{name}.csv").exists())
 
 
 def read_arguments(run_dir: Path) -> list[str]:

@@ -128,7 +128,7 @@ def plot_planner_errors(run: str | Path, kind: Literal["present", "action"], ax:
     :raises ValueError: when the folder holds no such error
     """
     files = sorted(
-        Path(run).glob("progress*.csv"), key=lambda file: int(file.stem.removeprefix("progress").strip("_") or 0)
+        Path(run).glob("progress*.csv"), key=lambda file: [int(number) for number in file.stem.split("_")[1:]]
     )
     rows = [row for file in files for row in csv.DictReader(file.read_text().splitlines())]
     names = {name for row in rows for name in row}

@@ -157,3 +157,11 @@ def test_help_shows_both_command_lines(capsys: pytest.CaptureFixture[str]) -> No
 
 def test_resume_is_taken_out_of_a_command_line() -> None:
     assert train.without_resume(["--resume", "a", "-P", "--resume=b", "-n", "5"]) == ["-P", "-n", "5"]
+
+
+def test_no_log_is_overwritten(tmp_path: Path) -> None:
+    names = []
+    for steps in (0, 500, 500, 500, 900, 0):
+        names.append(zoo.log_suffix(tmp_path, steps))
+        (tmp_path / f"progress{names[-1]}.csv").touch()
+    assert names == ["", "_500", "_500_2", "_500_3", "_900", "_0_2"]
