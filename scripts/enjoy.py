@@ -64,6 +64,15 @@ class CannotDraw(RuntimeError):
         )
 
 
+def follow(env: gym.Env[Any, Any]) -> None:
+    """Use a MuJoCo task's own tracking camera, where the default one stays behind while the robot runs away."""
+    renderer = getattr(getattr(env, "unwrapped", None), "mujoco_renderer", None)
+    if renderer is not None and renderer.camera_id in (None, -1):
+        import mujoco
+
+        renderer.camera_id = mujoco.mj_name2id(renderer.model, mujoco.mjtObj.mjOBJ_CAMERA, "track")  # -1: has none
+
+
 class Video:
     """Writes the steps of a task to an mp4 or a GIF that plays in real time, by leaving out steps.
 
@@ -89,6 +98,8 @@ class Video:
         self._steps += 1
         if due < self.frames:
             return
+        if self._writer is None:
+            follow(env)
         try:
             frame: Any = env.render()
         except Exception as error:

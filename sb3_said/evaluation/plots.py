@@ -154,8 +154,8 @@ def plot_planner_errors(run: str | Path, kind: Literal["present", "action"], ax:
     ax.set_xlabel("planner updates")
     unit = {"present": "standard deviations", "action": "environment units"}[kind]
     ax.set_ylabel(f"{kind}{'-state' if kind == 'present' else ''} error ({unit})")
-    ax.set_ylim(bottom=0)
-    ax.legend(frameon=False, fontsize="small", ncols=2 if len(columns) > 6 else 1)
+    ax.set_ylim(0, 1.6 * ax.get_ylim()[1])  # room for a legend that no curve runs through
+    ax.legend(frameon=False, fontsize="small", ncols=2 if len(columns) > 6 else 1, loc="upper center")
     return ax
 
 

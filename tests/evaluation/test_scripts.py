@@ -171,3 +171,11 @@ def test_enjoy_prints_every_episode(run: Path, tmp_path: Path, capsys: pytest.Ca
     enjoy.main([str(run), "--record", str(film), "--episodes", "2", "--answer", "expert", "--device", "cpu"])
     out = capsys.readouterr().out
     assert "seed 10000: return" in out and "seed 10001: return" in out and film.stat().st_size > 0
+
+
+@pytest.mark.parametrize(("env_id", "camera"), [("Hopper-v5", 0), ("InvertedPendulum-v5", -1)])
+def test_videos_follow_a_robot_that_has_a_camera_for_it(env_id, camera):
+    env = gym.make(env_id, render_mode="rgb_array")
+    enjoy.follow(env)
+    assert env.unwrapped.mujoco_renderer.camera_id == camera
+    env.close()
