@@ -34,7 +34,7 @@ examples:
 
   # a quick look: one depth, fewer updates, fewer episodes, into a folder of its own
   python scripts/tune.py --run logs/said/Hopper-v5-delay4_1 --depths 2 --gradient-steps 5000 --episodes 10 \\
-      --output /tmp/look
+      --output look
 
   # any temperature from 0 to 1, in a data base
   python scripts/tune.py --run logs/said/Hopper-v5-delay4_1 --sampler tpe --n-trials 30 --storage sqlite:///tune.db
