@@ -243,7 +243,11 @@ class SafeSaveMixin(BaseAlgorithm):
         """As SB3's, where a path has to be that of a file without pickles, unless ``allow_pickle`` is True."""
         if not isinstance(load_path_or_dict, dict):
             load_path_or_dict = load_algorithm_file(load_path_or_dict, device, None, allow_pickle, load_data=False)[1]
-        super().set_parameters(load_path_or_dict, exact_match, device)
+        super().set_parameters(self._adapt_parameters(load_path_or_dict), exact_match, device)
+
+    def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:
+        """Return the state dicts to take over from those given; an algorithm may leave its own in their place."""
+        return params
 
 
 def _existing(path: PathOrFile) -> PathOrFile:

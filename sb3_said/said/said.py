@@ -14,8 +14,6 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import configure_logger
 
-from sb3_said.common.save_util import load_algorithm_file
-from sb3_said.common.tree_file import PathOrFile
 from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.sac import DelayedSAC
@@ -82,25 +80,17 @@ class SAID(DelayedSAC):
         super()._setup_model()
         self._planner_settings = asdict(self.policy.planner.config)
 
-    def set_parameters(
-        self,
-        load_path_or_dict: PathOrFile | dict[str, Any],
-        exact_match: bool = True,
-        device: th.device | str = "auto",
-        allow_pickle: bool = False,
-    ) -> None:
-        """As ``DelayedSAC``'s, but a planner that was never trained may be of other settings: it is not taken over."""
-        if not isinstance(load_path_or_dict, dict):
-            load_path_or_dict = load_algorithm_file(load_path_or_dict, device, None, allow_pickle, load_data=False)[1]
-        given, own = load_path_or_dict.get("policy", {}), self.policy.state_dict()
+    def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:
+        """Keep this agent's own planner where the given one was never trained and has other settings."""
+        given, own = params.get("policy", {}), self.policy.state_dict()
         shapes = [
             {name: value.shape for name, value in state.items() if name.startswith("planner.")}
             for state in (given, own)
         ]
         if given.get("planner_updates") == 0 and shapes[0] != shapes[1]:
             kept = {name: value for name, value in given.items() if not name.startswith("planner.")}
-            load_path_or_dict = {**load_path_or_dict, "policy": kept | {name: own[name] for name in shapes[1]}}
-        super().set_parameters(load_path_or_dict, exact_match, device)
+            params = {**params, "policy": kept | {name: own[name] for name in shapes[1]}}
+        return params
 
     def learn(
         self: SelfSAID,
