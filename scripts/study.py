@@ -85,10 +85,11 @@ class Search:
             if before is None:
                 self.study.set_user_attr("settings", common)
         if before is not None and before != common:
-            differing = [key for key in sorted({*before, *common}) if before.get(key) != common.get(key)]
+            old, now = ({**settings, **settings.get("config", {})} for settings in (before, common))
+            differing = [key for key in sorted({*old, *now} - {"config"}) if old.get(key) != now.get(key)]
             raise ValueError(
                 f"Study {self.name!r} in {self.storage} was begun with other settings: "
-                + "; ".join(f"{key} was {before.get(key)} and is now {common.get(key)}" for key in differing)
+                + "; ".join(f"{key} was {old.get(key)} and is now {now.get(key)}" for key in differing)
                 + ". Go on with the old ones, or begin another with --study-name."
             )
 

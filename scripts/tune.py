@@ -6,6 +6,7 @@ import argparse
 import json
 import time
 from argparse import Namespace
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,6 @@ from winner import RunConfig, write_text
 from sb3_said import SAID
 from sb3_said.common.checkpoint import CHECKPOINT_NAME
 from sb3_said.evaluation import bootstrap_interval, rollout
-from sb3_said.planner import PlannerConfig
 from sb3_said.said.tuning import Claim, DepthPlanners
 
 EPILOG = """\
@@ -147,9 +147,8 @@ def tune(args: argparse.Namespace) -> None:
     planners = DepthPlanners(model, args.run / CHECKPOINT_NAME, folder, args.gradient_steps, args.progress)
     for depth in args.depths:
         for temperature in args.temperatures:
-            PlannerConfig(**{**planners.base_kwargs, "depth": depth, "temperature": temperature})
-    settings = {**planners.settings(args.depths[0]), "env": run.info["env"], "delay": run.info["delay"]}
-    settings["config"] = {key: value for key, value in settings["config"].items() if key != "depth"}
+            replace(planners.config, depth=depth, temperature=temperature)
+    settings = {**planners.trial_settings(), "env": run.info["env"], "delay": run.info["delay"]}
     search = Search(
         folder,
         args.storage or str(folder / "study.log"),

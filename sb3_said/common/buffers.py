@@ -77,8 +77,8 @@ class DelayedReplayBuffer(ReplayBuffer):
         self.steps = np.zeros(shape, np.int32)
         # Tails: (state, age) that follow a row which no stored row continues. Slot -1: the next row continues.
         self.tail_slots = np.full(shape, -1, np.int32)
-        self.tail_states = np.zeros((0, state_space.shape[0]), np.float32)
-        self.tail_ages = np.zeros(0, np.int16)
+        self.tail_states: np.ndarray = np.zeros((0, state_space.shape[0]), np.float32)
+        self.tail_ages: np.ndarray = np.zeros(0, np.int16)
         self._free_slots: list[int] = []
         # What follows the newest row of each environment, and the observation that would continue its episode.
         self._next_states = np.zeros((n_envs, state_space.shape[0]), np.float32)

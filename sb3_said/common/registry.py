@@ -6,6 +6,7 @@ import dataclasses
 import pathlib
 from collections import deque
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any, TypeVar
 
 import numpy as np
@@ -52,20 +53,23 @@ def _register_libraries() -> None:
     for name in activation.__all__:
         register_class(getattr(activation, name), f"torch.nn.{name}")
     register_class(th.nn.Identity, "torch.nn.Identity")
-    for value in vars(th.optim).values():
-        if isinstance(value, type) and issubclass(value, th.optim.Optimizer):
-            register_class(value, f"torch.optim.{value.__name__}")
+    for cls in _classes_in(th.optim, th.optim.Optimizer):
+        register_class(cls, f"torch.optim.{cls.__name__}")
     register_class(RMSpropTFLike)
     register_class(HerReplayBuffer)
     kinds = (BasePolicy, buffers.BaseBuffer, torch_layers.BaseFeaturesExtractor)
     for module in (policies, buffers, torch_layers, sac_policies, td3_policies, dqn_policies):
-        for value in vars(module).values():
-            if isinstance(value, type) and issubclass(value, kinds):
-                register_class(value)
+        for cls in _classes_in(module, *kinds):
+            register_class(cls)
     for kind in (bool, int, float):
         register_class(kind)
     for name in ("bool", "int8", "int16", "int32", "int64", "uint8", "float16", "float32", "float64"):
         register_class(np.dtype(name).type, f"numpy.{name}")
+
+
+def _classes_in(module: ModuleType, *kinds: type) -> list[type]:
+    # Python 3.10 takes an alias such as dict[str, int] for an instance of type, but its own type is none.
+    return [value for value in vars(module).values() if issubclass(type(value), type) and issubclass(value, kinds)]
 
 
 _register_libraries()

@@ -1,19 +1,22 @@
-"""Saving and loading of Stable-Baselines3 algorithms without pickle: a stranger's file cannot run code."""
+"""Saving and loading of Stable-Baselines3 algorithms and policies without pickle: a stranger's file runs no code."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pathlib
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any, TypeVar
 
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file, recursive_getattr, recursive_setattr
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import (
+    ConstantSchedule,
     check_for_correct_spaces,
     get_device,
     get_system_info,
@@ -36,8 +39,10 @@ from sb3_said.common.tree_file import (
 
 __all__ = [
     "PickleRefusedError",
+    "SafePolicyMixin",
     "SafeSaveMixin",
     "SavedFileError",
+    "explained_refusal",
     "load_algorithm_file",
     "load_metadata",
     "load_tree",
@@ -46,6 +51,7 @@ __all__ = [
 ]
 
 SelfSafeSave = TypeVar("SelfSafeSave", bound="SafeSaveMixin")
+SelfSafePolicy = TypeVar("SelfSafePolicy", bound="SafePolicyMixin")
 
 
 def save_algorithm(
@@ -124,14 +130,8 @@ def load_algorithm_file(
     if allow_pickle and _holds_pickle(path):
         pickled, params, variables = load_from_zip_file(path, load_data, custom_objects, device)  # type: ignore[arg-type]
         return pickled or {}, params, variables
-    try:
+    with explained_refusal("load"):
         saved = read_file(path, "algorithm")
-    except PickleRefusedError as error:
-        raise PickleRefusedError(
-            f"{error} Unpickling runs whatever code the file's author put there, so files with pickles, such as those"
-            " that Stable-Baselines3 itself saves, are refused. If you trust the author, use"
-            " load(path, allow_pickle=True), and save the agent again to get a file without pickles."
-        ) from error
     decoder = ObjectDecoder(saved.blobs, get_device(device))
     with readable(path):
         nodes, missing = saved.root["data"] if load_data else {}, saved.root["missing"]
@@ -248,6 +248,88 @@ class SafeSaveMixin(BaseAlgorithm):
     def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:
         """Return the state dicts to take over from those given; an algorithm may leave its own in their place."""
         return params
+
+
+class SafePolicyMixin(BasePolicy):
+    """Makes an SB3 policy save to and load from files without pickle. Name it before the policy, and register it.
+
+    >>> from stable_baselines3.sac.policies import SACPolicy
+    >>> from sb3_said.common.registry import register_class
+    >>> @register_class
+    ... class SafePolicy(SafePolicyMixin, SACPolicy):
+    ...     pass
+    """
+
+    def save(self, path: PathOrFile) -> None:
+        """Write networks and constructor arguments, all that ``predict`` needs; optimizers are the algorithm's.
+
+        :param path: where to write, as it is. Or a binary file object.
+        :raises ValueError: if a constructor argument is a function or an object of an unregistered class, or the
+            policy's own class is unregistered
+        """
+        arguments = self._get_constructor_parameters()
+        if "lr_schedule" in arguments:  # a method in SB3's files too that only stands in: no policy learns by itself
+            arguments["lr_schedule"] = ConstantSchedule(0.0)
+        encoder = ObjectEncoder()
+        try:
+            root = {
+                "class": encoder.encode(type(self), "its class"),
+                "arguments": encoder.encode(arguments, "arguments"),
+                "state_dict": encoder.encode(self.state_dict(), "state_dict"),
+            }
+        except ValueError as error:
+            raise ValueError(
+                f"Cannot save this {type(self).__name__}: {error}. Functions and objects of unregistered classes cannot"
+                " be written without pickle; register a class of your own with"
+                " sb3_said.common.registry.register_class."
+            ) from error
+        write_file(path, "policy", root, encoder.blobs, {"policy": type(self).__name__})
+
+    @classmethod
+    def load(
+        cls: type[SelfSafePolicy], path: PathOrFile, device: th.device | str = "auto", allow_pickle: bool = False
+    ) -> SelfSafePolicy:
+        """Build a policy from a file, running no code from it.
+
+        :param path: of the file, or a seekable binary file object
+        :param device: where the policy computes
+        :param allow_pickle: also load files of SB3's own ``save``, which can run any code: only for files you trust
+        :raises ValueError: if the file is damaged, foreign, newer than this package, of another class of policy, names
+            an unregistered class, or holds a pickle and ``allow_pickle`` is False
+        """
+        if allow_pickle and _holds_pickle(path):
+            return super().load(path, device)  # type: ignore[arg-type]
+        with explained_refusal("load"):
+            saved = read_file(path, "policy")
+        decoder = ObjectDecoder(saved.blobs)
+        with readable(path):
+            saved_class = decoder.decode(saved.root["class"])
+            if saved_class is not cls:
+                name = saved_class.__name__
+                raise SavedFileError(f"it holds a {name}, where {cls.__name__} was expected: load it with {name}.load")
+            arguments = decoder.decode(saved.root["arguments"])
+            policy = cls(**arguments)
+            policy.load_state_dict(Decoder(saved.blobs).decode(saved.root["state_dict"]))
+        policy.to(get_device(device))
+        if arguments.get("use_sde"):  # its noise was drawn before the parameters were there
+            policy.reset_noise()  # type: ignore[operator]
+        return policy
+
+
+@contextlib.contextmanager
+def explained_refusal(method: str) -> Iterator[None]:
+    """Add to the refusal of a pickle why it is refused, and how to load the file all the same.
+
+    :param method: that takes ``allow_pickle``
+    """
+    try:
+        yield
+    except PickleRefusedError as error:
+        raise PickleRefusedError(
+            f"{error} Unpickling runs whatever code the file's author put there, so files with pickles, such as those"
+            " that Stable-Baselines3 itself saves, are refused. If you trust the author, use"
+            f" {method}(path, allow_pickle=True), and save again to get a file without pickles."
+        ) from error
 
 
 def _existing(path: PathOrFile) -> PathOrFile:

@@ -6,13 +6,18 @@ import io
 import pathlib
 from typing import Any, ClassVar
 
+import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import DictReplayBufferSamples, GymEnv, ReplayBufferSamples, Schedule
+from stable_baselines3.common.utils import polyak_update
 
 from sb3_said.common.buffers import DelayedReplayBuffer
-from sb3_said.common.save_util import PickleRefusedError, SafeSaveMixin, load_tree, save_tree
+from sb3_said.common.checks import check_choice
+from sb3_said.common.precision import PRECISIONS, autocast
+from sb3_said.common.save_util import PickleRefusedError, SafeSaveMixin, explained_refusal, load_tree, save_tree
+from sb3_said.sac.networks import FusedAdam, StackedCritic
 from sb3_said.sac.policies import DelayedSACPolicy
 
 
@@ -31,13 +36,15 @@ class DelayedSAC(SafeSaveMixin, SAC):
     ============= ============= =======================
 
     The critics' true states come from replay (they arrive a few steps later on a real system too); acting needs none.
-    On a task without ``DelayedObservationWrapper`` this is SB3's SAC, update for update.
+    On a task without ``DelayedObservationWrapper`` this is SB3's SAC, update for update, in less time.
 
     :param policy: ``"MultiInputPolicy"`` or ``"MlpPolicy"``, which name the same class
     :param env: a task in a ``DelayedObservationWrapper``, or one with a 1-D Box observation (delay 0)
     :param learning_rate: of actor, critics and entropy coefficient; a number or a schedule
     :param augment_state: the actor reads [observation, action history, age]
     :param delay_reconciled_critic: the critics read the true state
+    :param precision: of the matrix products in updates: ``"float32"``, ``"bfloat16"``, or ``"auto"``, the latter where
+        the hardware has it; weights, losses, acting and gSDE (``use_sde``) are float32 in any case
     :param sac_kwargs: every other argument of :class:`stable_baselines3.SAC`
     :raises ValueError: for spaces that are neither, a ``VecNormalize`` of more than the observation, or options that
         need another replay buffer (``n_steps`` > 1) or policy
@@ -48,6 +55,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
         "MultiInputPolicy": DelayedSACPolicy,
     }
     policy: DelayedSACPolicy
+    critic: StackedCritic
+    critic_target: StackedCritic
     replay_buffer: DelayedReplayBuffer
 
     def __init__(
@@ -58,12 +67,17 @@ class DelayedSAC(SafeSaveMixin, SAC):
         *,
         augment_state: bool = True,
         delay_reconciled_critic: bool = True,
+        precision: str = "auto",
         **sac_kwargs: Any,
     ):
         if sac_kwargs.get("n_steps", 1) != 1:
             raise ValueError(
                 f"DelayedSAC learns from one-step targets, got n_steps={sac_kwargs['n_steps']}; leave it 1."
             )
+        check_choice("precision", precision, PRECISIONS)
+        if precision == "bfloat16" and sac_kwargs.get("use_sde"):
+            raise ValueError('gSDE is computed in float32: give precision="float32" or "auto" with use_sde=True.')
+        self.precision = precision
         self.augment_state = augment_state
         self.delay_reconciled_critic = delay_reconciled_critic
         if isinstance(policy, str):  # SB3 would refuse one of the two names, by the kind of space
@@ -76,6 +90,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
         self.policy_kwargs = {**user_kwargs, **self._policy_flags()}
         super()._setup_model()
         self.policy_kwargs = user_kwargs
+        if self.log_ent_coef is not None:
+            self.ent_coef_optimizer = FusedAdam([self.log_ent_coef], lr=self.lr_schedule(1))
 
     def _check_parts(self) -> None:
         """:raises ValueError: for a policy, a replay buffer or a normalisation that does not go with delays"""
@@ -106,6 +122,75 @@ class DelayedSAC(SafeSaveMixin, SAC):
         """Return what the policy's constructor needs of this algorithm's own arguments."""
         return {"augment_state": self.augment_state, "delay_reconciled_critic": self.delay_reconciled_critic}
 
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """Update critics, actor, entropy coefficient and target critics ``gradient_steps`` times, as SAC does."""
+        self.policy.set_training_mode(True)
+        optimizers = [self.actor.optimizer, self.critic.optimizer]
+        if self.ent_coef_optimizer is not None:
+            optimizers.append(self.ent_coef_optimizer)
+        self._update_learning_rate(optimizers)
+
+        losses = []  # read at the end: a read per update would make a GPU wait
+        for gradient_step in range(gradient_steps):
+            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            with autocast("float32" if self.use_sde else self.precision, self.device):
+                losses.append(self._update(batch))
+            if gradient_step % self.target_update_interval == 0:
+                self._update_targets()
+        self._n_updates += gradient_steps
+
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        names = ("ent_coef", "actor_loss", "critic_loss", "ent_coef_loss")
+        for name, mean in zip(names, th.stack(losses).mean(0).tolist(), strict=False):
+            self.logger.record(f"train/{name}", mean)
+
+    def _update(self, batch: ReplayBufferSamples | DictReplayBufferSamples) -> th.Tensor:
+        """Make one update of critics, actor and entropy coefficient.
+
+        :return: (3,) or (4,): entropy coefficient, losses of actor and critics, and of the coefficient if it is learned
+        """
+        # dones of shape (B, 1) leave out those due to time limits
+        rewards, discounts = batch.rewards[:, 0], self.gamma * (1 - batch.dones[:, 0])  # (B,)
+        if self.use_sde:
+            self.actor.reset_noise()
+        actions, log_prob = self.actor.action_log_prob(batch.observations)  # (B, act_dim), (B,)
+
+        # Entropy coefficient: towards the target entropy. Its old value serves the losses below.
+        ent_coef_losses = []
+        if self.log_ent_coef is None or self.ent_coef_optimizer is None:
+            ent_coef = self.ent_coef_tensor
+        else:
+            ent_coef = self.log_ent_coef.detach().exp()
+            assert isinstance(self.target_entropy, float)  # for mypy: set up by SB3
+            too_certain = (log_prob.detach() + self.target_entropy).mean()
+            ent_coef_losses.append(-self.log_ent_coef.detach() * too_certain)
+            self.log_ent_coef.grad = -too_certain.view(1)
+            self.ent_coef_optimizer.step()
+
+        # Critics: towards the reward and the soft value of the next state, the smallest of the target critics'
+        with th.no_grad():
+            next_actions, next_log_prob = self.actor.action_log_prob(batch.next_observations)
+            next_q = self.critic_target.q_values(batch.next_observations, next_actions).amin(0)  # (B,)
+            target = rewards + discounts * (next_q - ent_coef * next_log_prob)
+        errors = self.critic.q_values(batch.observations, batch.actions) - target  # (n_critics, B)
+        critic_loss = 0.5 * errors.square().mean(1).sum()
+        self.critic.optimizer.zero_grad()
+        critic_loss.backward()
+        self.critic.optimizer.step()
+
+        # Actor: towards actions of high value and entropy
+        q = self.critic.q_values(batch.observations, actions, frozen=True).amin(0)
+        actor_loss = (ent_coef * log_prob - q).mean()
+        self.actor.optimizer.zero_grad()
+        actor_loss.backward()
+        self.actor.optimizer.step()
+        return th.stack([loss.detach().view(()) for loss in (ent_coef, actor_loss, critic_loss, *ent_coef_losses)])
+
+    @th.no_grad()
+    def _update_targets(self) -> None:
+        th._foreach_lerp_(list(self.critic_target.parameters()), list(self.critic.parameters()), self.tau)
+        polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
+
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """Write the replay buffer to a file without pickle.
 
@@ -128,13 +213,11 @@ class DelayedSAC(SafeSaveMixin, SAC):
             holds a pickle
         """
         try:
-            state = load_tree(path)  # type: ignore[arg-type]
-        except PickleRefusedError as error:
+            with explained_refusal("load_replay_buffer"):
+                state = load_tree(path)  # type: ignore[arg-type]
+        except PickleRefusedError:
             if not allow_pickle:
-                raise PickleRefusedError(
-                    f"{error} Unpickling runs whatever code the file's author put there. If you trust the author, use "
-                    "load_replay_buffer(path, allow_pickle=True), and save it again to get a file without pickle."
-                ) from error
+                raise
             super().load_replay_buffer(path, truncate_last_traj)
             return
         self.replay_buffer.load_state_dict(state)

@@ -1,4 +1,4 @@
-"""Actor and critics of ``DelayedSAC``: SB3's own, told what to read."""
+"""The policy of ``DelayedSAC``: SAC's actor and critics, told what to read."""
 
 from __future__ import annotations
 
@@ -9,16 +9,18 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
-from stable_baselines3.sac.policies import Actor, ContinuousCritic, SACPolicy
+from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from sb3_said.common.buffers import UNDELAYED, check_spaces
 from sb3_said.common.extractors import KeyExtractor, StateAugmentedExtractor
 from sb3_said.common.registry import register_class
+from sb3_said.common.save_util import SafePolicyMixin
+from sb3_said.sac.networks import FusedAdam, StackedActor, StackedCritic
 
 
 @register_class
-class DelayedSACPolicy(SACPolicy):
-    """SAC's policy for delayed observations; for a plain 1-D Box it is SB3's ``SACPolicy``.
+class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
+    """SAC's policy for delayed observations; for a plain 1-D Box it computes what SB3's ``SACPolicy`` does.
 
     :param augment_state: the actor reads [observation, action history, age] instead of the observation alone
     :param delay_reconciled_critic: the critics read the true state, which only replay knows, instead of what the actor
@@ -26,6 +28,9 @@ class DelayedSACPolicy(SACPolicy):
     :param policy_kwargs: of ``SACPolicy``
     :raises ValueError: for other spaces, or when a features extractor is given or shared in a delayed task
     """
+
+    critic: StackedCritic
+    critic_target: StackedCritic
 
     def __init__(
         self,
@@ -53,6 +58,13 @@ class DelayedSACPolicy(SACPolicy):
                     "share_features_extractor=False."
                 )
             self.replay_space = spaces.Dict({**observation_space.spaces, UNDELAYED: state_space})
+        if policy_kwargs.get("optimizer_class", th.optim.Adam) is th.optim.Adam:
+            policy_kwargs["optimizer_class"] = FusedAdam
+        elif (policy_kwargs.get("optimizer_kwargs") or {}).get("fused"):
+            raise ValueError(
+                f"A fused {policy_kwargs['optimizer_class'].__name__} does not tell that it has changed the weights; "
+                "leave fused out of optimizer_kwargs, or take Adam, which is fused here."
+            )
         super().__init__(observation_space, action_space, lr_schedule, **policy_kwargs)
 
     def _actor_extractor(self) -> BaseFeaturesExtractor | None:
@@ -70,12 +82,16 @@ class DelayedSACPolicy(SACPolicy):
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         if self.replay_space is not None:
             self.actor_kwargs["observation_space"] = self.replay_space
-        return super().make_actor(features_extractor or self._actor_extractor())
+        if self.actor_kwargs["use_sde"]:
+            return super().make_actor(features_extractor or self._actor_extractor())
+        kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor or self._actor_extractor())
+        return StackedActor(**kwargs).to(self.device)
 
-    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
+    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> StackedCritic:
         if self.replay_space is not None:
             self.critic_kwargs["observation_space"] = self.replay_space
-        return super().make_critic(features_extractor or self._critic_extractor())
+        kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor or self._critic_extractor())
+        return StackedCritic(**kwargs).to(self.device)
 
     def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
         """Turn what ``predict`` was given into tensors, after checking it.

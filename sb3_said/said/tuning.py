@@ -16,12 +16,14 @@ import torch as th
 from stable_baselines3.common.logger import Logger, make_output_format
 
 from sb3_said.common.save_util import load_tree, save_tree
-from sb3_said.planner import InpaintingPlanner, PlannerConfig
+from sb3_said.planner import InpaintingPlanner
+from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.said.callbacks import PLANNER_CHECKPOINT_NAME, PlannerTrainingCallback
 from sb3_said.said.said import SAID
 
 STALE_AFTER = 120.0  # seconds without a sign of life
 HEARTBEAT = 10.0  # seconds between two signs of life
+TRIED_SETTINGS = ("depth", "temperature")  # of the planner, what a search varies
 
 
 class Claim:
@@ -143,10 +145,9 @@ class DepthPlanners:
         self.folder = Path(folder)
         self.gradient_steps = gradient_steps or model.planner_gradient_steps
         self.progress_bar = progress_bar
-        self.base_kwargs: dict[str, Any] = dict(model.planner_kwargs or {})
+        self.config = model.policy.planner.config
         self._depth: int | None = None
-        planner = model.policy.planner
-        own = planner.config.depth
+        own = self.config.depth
         if int(model.policy.planner_updates) == self.gradient_steps and not self.is_ready(own):
             self._save(own)
 
@@ -175,33 +176,37 @@ class DepthPlanners:
                         self._train(depth)
             self._load(depth)
             self._depth = depth
-        planner, policy = self.model.policy.planner, self.model.policy
-        planner.config = replace(planner.config, temperature=temperature)
-        policy.planner_kwargs = {**self.base_kwargs, "depth": depth, "temperature": temperature}
-        self.model.planner_kwargs = policy.planner_kwargs
+        self.model.set_planner(temperature=temperature)
 
-    def settings(self, depth: int) -> dict[str, Any]:
-        """Return what decides a depth's weights, in JSON types. The temperature does not: it acts on samples only."""
-        config = asdict(PlannerConfig(**{**self.base_kwargs, "depth": depth}))
-        del config["temperature"]
-        model = self.model
+    def training_settings(self, depth: int) -> dict[str, Any]:
+        """Return what decides a depth's weights, in JSON types: how the planner answers does not."""
+        model, config = self.model, asdict(replace(self.config, depth=depth))
         return {
             "gradient_steps": self.gradient_steps,
             "newest_fraction": model.planner_newest_fraction,
             "training_seed": model.seed or 0,
             "trained_steps": model.num_timesteps,
-            "config": json.loads(json.dumps(config)),
+            "config": {key: value for key, value in _plain(config).items() if key not in SAMPLING_SETTINGS},
         }
 
+    def trial_settings(self) -> dict[str, Any]:
+        """Return what trials must share to be compared, in JSON types: all but the depth and the temperature they try.
+
+        How the planner answers is part of it: more candidates, for one, earn other returns with the same weights.
+        """
+        config = {key: value for key, value in _plain(asdict(self.config)).items() if key not in TRIED_SETTINGS}
+        return {**self.training_settings(self.config.depth), "config": config}
+
     def _replace_planner(self, depth: int) -> None:
-        policy = self.model.policy
+        model, policy = self.model, self.model.policy
         old = policy.planner
         with th.random.fork_rng(devices=[]):
-            th.manual_seed(self.model.seed or 0)
-            config = PlannerConfig(**{**self.base_kwargs, "depth": depth})
-            planner = InpaintingPlanner(old.obs_dim, old.act_dim, old.max_delay, config)
-        policy.planner = planner.to(self.model.device).requires_grad_(False)
+            th.manual_seed(model.seed or 0)
+            planner = InpaintingPlanner(old.obs_dim, old.act_dim, old.max_delay, replace(self.config, depth=depth))
+        policy.planner = planner.to(model.device).requires_grad_(False)
         policy.planner_updates.zero_()
+        policy.planner_kwargs = {**policy.planner_kwargs, "depth": depth}
+        model.planner_kwargs = {**(model.planner_kwargs or {}), "depth": depth}
         policy.set_training_mode(False)
         self._depth = None
 
@@ -242,14 +247,12 @@ class DepthPlanners:
     def _save(self, depth: int) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
         planner = dict(self.model.policy.planner.state_dict())
-        save_tree(self.path(depth), {"settings": self.settings(depth), "planner": planner})
+        save_tree(self.path(depth), {"settings": self.training_settings(depth), "planner": planner})
 
     def _load(self, depth: int) -> None:
         saved = load_tree(self.path(depth))
-        old, now = saved["settings"], self.settings(depth)
-        if old != now:
-            old, now = ({**x, **x["config"]} for x in (old, now))
-            differing = [key for key in now if key != "config" and old.get(key) != now[key]]
+        old, now = ({**x, **x["config"]} for x in (saved["settings"], self.training_settings(depth)))
+        if differing := [key for key in now if key != "config" and old.get(key) != now[key]]:
             raise ValueError(
                 f"{self.path(depth)} is of another training: "
                 + "; ".join(f"{key} was {old.get(key)} and is now {now[key]}" for key in differing)
@@ -258,6 +261,11 @@ class DepthPlanners:
         policy = self.model.policy
         policy.planner.load_state_dict(saved["planner"])
         policy.planner_updates.fill_(float(self.gradient_steps))
+
+
+def _plain(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return settings as they come back from JSON, which knows no tuples."""
+    return dict(json.loads(json.dumps(settings)))
 
 
 def _read(path: Path) -> str | None:

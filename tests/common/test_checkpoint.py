@@ -7,8 +7,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from kill import Kill, Killed
 from stable_baselines3 import SAC
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
+from stable_baselines3.common.callbacks import CallbackList, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecNormalize
@@ -47,21 +48,6 @@ def make(env=None, cls=DelayedSAC, **kwargs):
 def evaluation(folder, env=None):
     env = Monitor(delayed()) if env is None else env
     return EvalCallback(env, eval_freq=20, n_eval_episodes=2, log_path=str(folder / "evaluations"), verbose=0)
-
-
-class Killed(Exception):
-    pass
-
-
-class Kill(BaseCallback):
-    def __init__(self, at):
-        super().__init__()
-        self.at = at
-
-    def _on_step(self):
-        if self.num_timesteps >= self.at:
-            raise Killed
-        return True
 
 
 def run_and_kill(model, folder, at=70, save_freq=50, callbacks=()):

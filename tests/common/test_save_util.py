@@ -1,5 +1,6 @@
 """Saved files: what goes in comes out bit for bit, and nothing in a file can run."""
 
+import contextlib
 import io
 import json
 import math
@@ -21,17 +22,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from safetensors.torch import load as load_safetensors
+from small_task import delayed
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.sac.policies import SACPolicy
 
+from sb3_said import SAID, DelayedSAC
 from sb3_said.common import registry, tree_file
 from sb3_said.common.registry import register_class
 from sb3_said.common.save_util import (
+    SafePolicyMixin,
     SafeSaveMixin,
     load_algorithm_file,
     load_metadata,
@@ -46,6 +51,16 @@ class SafeSAC(SafeSaveMixin, SAC):
 
 
 class SafePPO(SafeSaveMixin, PPO):
+    pass
+
+
+@register_class
+class SafePolicy(SafePolicyMixin, SACPolicy):
+    pass
+
+
+@register_class
+class SafeActorCriticPolicy(SafePolicyMixin, ActorCriticPolicy):
     pass
 
 
@@ -169,16 +184,13 @@ def test_a_tree_comes_back_bit_for_bit(tree):
     assert same(tree, round_trip(tree))
 
 
-@pytest.mark.filterwarnings("ignore:ComplexHalf")
-@pytest.mark.parametrize("dtype", [value for value in vars(th).values() if isinstance(value, th.dtype)])
-def test_every_dense_dtype(dtype):
-    if str(dtype).startswith(("torch.q", "torch.bits")) or dtype.itemsize == 0:
-        pytest.skip("no plain number")
-    try:
-        tensor = th.arange(24, dtype=th.uint8).tile(16)[: 24 * dtype.itemsize].clone()
-        tensor = (tensor % 2).bool() if dtype == th.bool else tensor.view(dtype)
-    except RuntimeError:
-        pytest.skip("torch itself cannot make one")
+@pytest.mark.filterwarnings("ignore:ComplexHalf", "ignore:torch.quantize_per_tensor")
+@pytest.mark.parametrize(
+    "dtype", sorted({value for value in vars(th).values() if isinstance(value, th.dtype)}, key=str)
+)
+def test_every_dtype(dtype):
+    tensor = th.arange(24, dtype=th.uint8).tile(16)[: 24 * dtype.itemsize].clone()
+    tensor = (tensor % 2).bool() if dtype == th.bool else tensor.view(dtype)
     tree = {"vector": tensor, "scalar": tensor[0], "empty": tensor[:0].reshape(0, 3)}
     assert same(tree, round_trip(tree))
 
@@ -233,7 +245,7 @@ def test_metadata(tmp_path):
     description = load_metadata(tmp_path / "new" / "folder" / "tree")
     assert description["metadata"] == {"step": 5}
     assert description["format"] == tree_file.FORMAT
-    assert description["versions"]["torch"] == th.__version__
+    assert description["versions"]["torch"].split("+")[0] == th.__version__.split("+")[0]  # wheels may hide the build
     with pytest.raises(ValueError, match="metadata must be JSON"):
         save_tree(tmp_path / "tree", 1, {"array": np.zeros(1)})
 
@@ -617,6 +629,170 @@ def test_set_parameters_from_a_file(saved, trained):
     assert same(model.get_parameters(), trained.get_parameters())
 
 
+# --- policies ---
+
+
+def draws(policy, observations):
+    """Answers of a policy: the deterministic one, and one at random."""
+    th.manual_seed(1)
+    return [policy.predict(observations, deterministic=deterministic)[0] for deterministic in (True, False)]
+
+
+def make_policy(cls=SafePolicy, use_sde=False, **policy_kwargs):
+    """A policy with weights that no constructor gives."""
+    model = make_sac(cls=SAC, policy=cls, use_sde=use_sde, policy_kwargs={"net_arch": [8]} | policy_kwargs)
+    with th.no_grad():
+        for parameter in model.policy.parameters():
+            parameter.add_(0.1)
+    return model.policy
+
+
+@pytest.mark.parametrize(
+    "policy_kwargs",
+    [
+        {},
+        {"activation_fn": th.nn.ELU, "net_arch": {"pi": [8], "qf": [4, 4]}, "n_critics": 3},
+        {"optimizer_class": th.optim.AdamW, "optimizer_kwargs": {"eps": 1e-5}, "normalize_images": False},
+    ],
+    ids=["plain", "networks", "optimizer"],
+)
+def test_a_policy_comes_back_whole(policy_kwargs, tmp_path):
+    policy = make_policy(**policy_kwargs)
+    policy.save(tmp_path / "policy")
+    assert [path.name for path in tmp_path.iterdir()] == ["policy"]  # as SB3, which adds no suffix
+    assert load_metadata(tmp_path / "policy")["metadata"] == {"policy": "SafePolicy"}
+    loaded = SafePolicy.load(tmp_path / "policy", device="cpu")
+    assert type(loaded) is SafePolicy and same(dict(policy.state_dict()), dict(loaded.state_dict()))
+    assert (loaded.observation_space, loaded.action_space) == (policy.observation_space, policy.action_space)
+    arguments, expected = loaded._get_constructor_parameters(), policy._get_constructor_parameters()
+    del arguments["lr_schedule"], expected["lr_schedule"]  # of the algorithm
+    assert arguments == expected
+    observations = np.stack([policy.observation_space.sample() for _ in range(5)])
+    assert same(draws(policy, observations), draws(loaded, observations))
+
+
+def test_the_noise_of_a_loaded_policy_is_that_of_its_parameters(tmp_path):
+    policy = make_policy(use_sde=True)
+    with th.no_grad():
+        policy.actor.log_std.fill_(-20.0)
+    policy.save(tmp_path / "policy")
+    loaded = SafePolicy.load(tmp_path / "policy", device="cpu")
+    certain, noisy = draws(loaded, np.zeros((4, 3), np.float32))
+    np.testing.assert_allclose(noisy, certain, atol=1e-5)
+
+
+def test_policies_in_file_objects_and_on_policy():
+    policy, file = SafePPO(SafeActorCriticPolicy, "CartPole-v1", device="cpu").policy, io.BytesIO()
+    policy.save(file)
+    loaded = SafeActorCriticPolicy.load(file, device="cpu")
+    observations = np.stack([policy.observation_space.sample() for _ in range(5)])
+    assert same(draws(policy, observations), draws(loaded, observations))
+
+
+@pytest.mark.parametrize(
+    ("cls", "flags"),
+    [
+        (DelayedSAC, {"augment_state": False, "delay_reconciled_critic": True}),
+        (DelayedSAC, {"augment_state": True, "delay_reconciled_critic": False}),
+        (SAID, {"augment_state": True, "delay_reconciled_critic": True}),
+    ],
+    ids=["DR", "SA", "SAID"],
+)
+def test_the_policies_of_this_package(cls, flags, tmp_path):
+    planner = {"d_model": 32, "depth": 1, "horizon": 3, "batch_size": 8, "sampling_steps": 2, "n_candidates": 3}
+    kwargs = {"planner_kwargs": planner, "planner_gradient_steps": 3} if cls is SAID else {}
+    env = delayed(2, max_delay=3)
+    model = make_sac(env, cls=cls, **flags, **kwargs).learn(30)
+    policy = model.policy
+    policy.save(tmp_path / "policy")
+    loaded = type(policy).load(tmp_path / "policy", device="cpu")
+    assert same(dict(policy.state_dict()), dict(loaded.state_dict()))
+    assert loaded.observation_space == model.observation_space and loaded.max_delay == 3
+    assert {name: getattr(loaded, name) for name in flags} == flags
+    first = env.reset(seed=1)[0]
+    second = env.step(np.ones(1, np.float32))[0]
+    observations = {key: np.stack([first[key], second[key]]) for key in first}
+    for answer in ("expert", "planner") if cls is SAID else (None,):
+        answers = []
+        for each in (policy, loaded):
+            with each.answering(answer) if answer else contextlib.nullcontext():
+                answers.append(draws(each, observations))
+        assert same(*answers)
+    if cls is SAID:
+        assert loaded.planner_is_trained and loaded.planner.config == policy.planner.config
+        with pytest.raises(
+            ValueError, match=r"it holds a SAIDPolicy, where DelayedSACPolicy was expected: load it with"
+        ):
+            DelayedSAC.policy_aliases["MlpPolicy"].load(tmp_path / "policy")
+
+
+def test_policies_of_another_class_or_kind_are_refused(saved, tmp_path):
+    make_policy().save(tmp_path / "policy")
+    with pytest.raises(ValueError, match=r"a SafePolicy, where SafeActorCriticPolicy was expected.*SafePolicy\.load"):
+        SafeActorCriticPolicy.load(tmp_path / "policy")
+    with pytest.raises(ValueError, match="kind 'algorithm', where 'policy' was expected"):
+        SafePolicy.load(saved)
+    with pytest.raises(ValueError, match="kind 'policy', where 'algorithm' was expected"):
+        SafeSAC.load(tmp_path / "policy")
+    with pytest.raises(FileNotFoundError):
+        SafePolicy.load(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    ("member", "node", "message"),
+    [
+        ("class", {"!class": "os.system"}, "which is not registered"),
+        ("class", "SafePolicy", "damaged"),
+        ("arguments", {"net_arch": [8]}, "damaged"),
+        ("state_dict", {}, "Missing key"),
+        ("state_dict", {"actor": {"!class": "torch.nn.ReLU"}}, "unknown entry '!class'"),
+    ],
+    ids=str,
+)
+def test_tampered_policies_are_refused(member, node, message, tmp_path):
+    def change(members):
+        return members | {"tree.json": json.dumps(json.loads(members["tree.json"]) | {member: node})}
+
+    make_policy().save(tmp_path / "policy")
+    edit(tmp_path / "policy", change)
+    with pytest.raises(ValueError, match=f"(?s)Cannot load.*{message}"):
+        SafePolicy.load(tmp_path / "policy")
+
+
+def test_a_policy_that_cannot_be_written_leaves_the_old_file(tmp_path):
+    make_policy().save(tmp_path / "policy")
+    before = (tmp_path / "policy").read_bytes()
+    with pytest.raises(ValueError, match=r"arguments\['activation_fn'\] is <function.*register_class"):
+        make_policy(activation_fn=lambda: th.nn.ReLU()).save(tmp_path / "policy")
+
+    class OwnPolicy(SafePolicyMixin, SACPolicy):
+        pass
+
+    with pytest.raises(ValueError, match=r"Cannot save this OwnPolicy: its class is .*register_class"):
+        make_policy(OwnPolicy).save(tmp_path / "policy")
+    assert (tmp_path / "policy").read_bytes() == before
+
+
+def test_policies_of_sb3_are_refused_until_trusted(tmp_path):
+    policy, target = make_policy(), tmp_path / "harm"
+    SACPolicy.save(policy, tmp_path / "policy")
+    with pytest.raises(ValueError, match=r"hold pickles.*runs whatever code.*load\(path, allow_pickle=True\)"):
+        SafePolicy.load(tmp_path / "policy")
+    loaded = SafePolicy.load(tmp_path / "policy", device="cpu", allow_pickle=True)
+    assert type(loaded) is SafePolicy and same(dict(policy.state_dict()), dict(loaded.state_dict()))
+    policy.save(tmp_path / "safe")
+    assert same(policy.state_dict(), SafePolicy.load(tmp_path / "safe", "cpu", allow_pickle=True).state_dict())
+
+    policy.optimizer_kwargs = {"eps": Bomb(target)}
+    SACPolicy.save(policy, tmp_path / "policy")
+    with pytest.raises(ValueError, match="pickle"):
+        SafePolicy.load(tmp_path / "policy")
+    assert not target.exists()
+    with contextlib.suppress(TypeError):  # the optimizer cannot be made of it
+        SafePolicy.load(tmp_path / "policy", allow_pickle=True, device="cpu")
+    assert target.exists()  # the bomb works: the refusal is what held it back
+
+
 # --- attributes that cannot be written ---
 
 
@@ -695,6 +871,9 @@ def test_loading_never_unpickles(trained, saved, monkeypatch):
     loaded = SafeSAC.load(saved, device="cpu")
     make_sac().set_parameters(saved)
     assert same(trained.get_parameters(), loaded.get_parameters())
+    file = io.BytesIO()
+    make_policy().save(file)
+    SafePolicy.load(file, device="cpu")
 
 
 def test_no_member_is_a_pickle(saved):

@@ -6,7 +6,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from kill import Kill, Killed
+from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import KVWriter, Logger
 
 from sb3_said import SAID, DelayedObservationWrapper, PlannerTrainingCallback
@@ -178,21 +179,6 @@ def test_cancelling_one_of_several_trainings_does_not_end_learning(monkeypatch, 
 
 
 # ---------------------------------------------------------------------------------------------------- going on
-
-
-class Killed(Exception):
-    pass
-
-
-class Kill(BaseCallback):
-    def __init__(self, at):
-        super().__init__()
-        self.at = at
-
-    def _on_step(self):
-        if self.num_timesteps == self.at:
-            raise Killed
-        return True
 
 
 @pytest.mark.parametrize("killed_at", [1, 4, 5])

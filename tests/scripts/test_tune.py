@@ -10,6 +10,8 @@ import subprocess
 import sys
 import time
 from argparse import Namespace
+from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +34,9 @@ from zoo import DelayedExperimentManager, Run
 
 from sb3_said import SAID
 from sb3_said.common.checkpoint import CHECKPOINT_NAME
+from sb3_said.common.save_util import load_tree
 from sb3_said.evaluation import rollout
+from sb3_said.planner import PlannerConfig
 from sb3_said.said import tuning
 from sb3_said.said.tuning import Claim, DepthPlanners
 
@@ -43,19 +47,35 @@ SCRIPT = Path(tune.__file__)
 QUICK = ["--episodes", "4", "--round", "2", "--report-episodes", "3", "--device", "cpu", "--num-threads", "1"]
 
 
-def train_run(folder: Path, algo: str, *params: str) -> Path:
+def train_run(folder: Path, algo: str, *params: str, delay: Sequence[int] = (2,)) -> Path:
     train.main(
-        ["--algo", algo, "--env", ENV, "--delay", "2", "--preset", "cpu", "-f", str(folder), "--seed", "3",
+        ["--algo", algo, "--env", ENV, "--delay", *map(str, delay), "--preset", "cpu", "-f", str(folder), "--seed", "3",
          "--num-threads", "1", "--eval-freq", "-1", "--device", "cpu", "--verbose", "0", "-n", "200",
          "-params", "learning_starts:100", "buffer_size:400", *params]
     )  # fmt: skip
-    return folder / algo / f"{ENV}-delay2_1"
+    return next((folder / algo).iterdir())
+
+
+def train_said(folder: Path, *params: str, delay: Sequence[int] = (2,)) -> Path:
+    planner = (f"planner_gradient_steps:{STEPS}", f"planner_kwargs:{PLANNER}")
+    return train_run(folder, "said", *planner, *params, delay=delay)
+
+
+def read_by_train(best: Path, delay: list[int], preset: str, folder: Path) -> dict[str, Any]:
+    """Return the hyper-parameters that train.py gets from a best.yml."""
+    run = Run([], delay, preset, 25_000)
+    manager = DelayedExperimentManager(run, Namespace(), "said", ENV, str(folder), config=str(best), verbose=0)
+    return manager.read_hyperparameters()[0]
+
+
+def config_of(run: Path) -> dict[str, Any]:
+    """Return the hyper-parameters that a run was trained with."""
+    return dict(yaml.load((run / ENV / "config.yml").read_text(), Loader=yaml.UnsafeLoader))
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("logs")
-    return train_run(folder, "said", f"planner_gradient_steps:{STEPS}", f"planner_kwargs:{PLANNER}")
+    return train_said(tmp_path_factory.mktemp("logs"))
 
 
 @pytest.fixture
@@ -132,19 +152,51 @@ def test_a_search_from_grid_to_report(
     assert [(t["depth"], t["temperature"]) for t in trials[4:]] == [(1, 0.5)]
 
 
+@pytest.mark.parametrize(
+    ("delay", "params"),
+    [
+        ([0, 3], []),
+        ([2], ["normalize:dict(norm_obs_keys=['observation'])"]),
+        ([1, 2], ["normalize:dict(norm_obs=False)"]),
+    ],
+    ids=["drawn delay", "VecNormalize", "normalized rewards"],
+)
+def test_a_search_with_a_drawn_delay_or_vec_normalize(delay: list[int], params: list[str], tmp_path: Path) -> None:
+    run = train_said(tmp_path, *params, delay=delay)
+    tune.main(["--run", str(run), "--depths", "1", "2", "--temperatures", "0.5", *QUICK])
+    results = json.loads((run / "tune" / "results.json").read_text())
+    assert [(trial["depth"], trial["temperature"]) for trial in results["trials"]] == [(1, 0.5), (2, 0.5)]
+
+    # A depth is trained on the very data, in the very units, that the run's own planner was.
+    own, other = (load_tree(run / "tune" / f"planner_depth{depth}.zip")["planner"] for depth in (1, 2))
+    statistics = [name for name in own if name.startswith("normalizer.")]
+    assert statistics
+    for name in statistics:
+        th.testing.assert_close(other[name], own[name], rtol=0, atol=0)
+
+    # What is reported is what best.zip and its statistics give again, and best.yml is of the same task.
+    best, report = load_run(run / "tune" / "best.zip", device="cpu"), results["report"]
+    assert (best.normalize is not None) == bool(params)
+    for one in report["results"]:
+        with best.model.policy.answering(one["label"]):
+            played = rollout(best.model, best.make_env, 3, report["seed"], n_envs=8, normalize=best.normalize)
+        assert one["returns"] == played.returns.tolist()
+    expected = {**config_of(run), "n_timesteps": 200}
+    expected["planner_kwargs"] |= {name: results["winner"][name] for name in ("depth", "temperature")}
+    assert read_by_train(run / "tune" / "best.yml", delay, "cpu", tmp_path) == expected
+    command = RunConfig.read(run).train_command(run / "tune")
+    assert f"--delay {' '.join(map(str, delay))} -conf" in command
+
+
 def test_train_reads_the_winner(run: Path, tmp_path: Path) -> None:
     (run / "tune").mkdir()
     config = RunConfig.read(run)
     assert config.write_best(run / "tune", {"depth": 2, "temperature": 0.3}, "for a test") == []
     best = run / "tune" / "best.yml"
+    expected = {**config_of(run), "n_timesteps": 200}
+    expected["planner_kwargs"] |= {"depth": 2, "temperature": 0.3}
     for preset in ("cpu", "paper"):  # "paper" is the default on a machine with a GPU
-        manager = DelayedExperimentManager(
-            Run([], [2], preset, 25_000), Namespace(), "said", ENV, str(tmp_path), config=str(best), verbose=0
-        )
-        found, _ = manager.read_hyperparameters()
-        before = yaml.load((run / ENV / "config.yml").read_text(), Loader=yaml.UnsafeLoader)
-        before["planner_kwargs"] |= {"depth": 2, "temperature": 0.3}
-        assert found == {**before, "n_timesteps": 200}
+        assert read_by_train(best, [2], preset, tmp_path) == expected
     assert config.train_command(run / "tune").endswith(f"--env {ENV} --delay 2 -conf {best}")
     train.main(["--algo", "said", "--env", ENV, "--delay", "2", "-conf", str(best), "-f", str(tmp_path), "-n", "120",
                 "--num-threads", "1", "--eval-freq", "-1", "--device", "cpu", "--verbose", "0"])  # fmt: skip
@@ -224,6 +276,61 @@ def test_planners_of_another_training_are_refused(run: Path, tmp_path: Path) -> 
     make_planners(run, tmp_path, 2).put(2, 0.5)
     with pytest.raises(ValueError, match=r"gradient_steps was 2 and is now 4.*delete the file"):
         make_planners(run, tmp_path, 4).put(2, 0.5)
+
+
+def test_how_a_planner_answers_is_no_matter_of_its_training(run: Path, tmp_path: Path, trainings: list[int]) -> None:
+    first = make_planners(run, tmp_path, 2)
+    first.put(2, 0.5)
+    model = load_run(run, device="cpu").model
+    assert isinstance(model, SAID)
+    model.set_planner(n_candidates=3, sampling_steps=2)
+    again = DepthPlanners(model, run / CHECKPOINT_NAME, tmp_path, 2)
+    again.put(2, 0.1)
+    assert trainings == [2]  # the same weights, other answers
+    config = model.policy.planner.config
+    assert (config.depth, config.temperature, config.n_candidates, config.sampling_steps) == (2, 0.1, 3, 2)
+    assert first.training_settings(2) == again.training_settings(2)
+    # Returns of other answers cannot be compared.
+    differing = first.trial_settings()["config"].items() ^ again.trial_settings()["config"].items()
+    assert {name for name, _ in differing} == {"n_candidates", "sampling_steps"}
+    Search(tmp_path, str(tmp_path / "study.log"), "test", [2], [0.5], settings=first.trial_settings())
+    with pytest.raises(
+        ValueError, match=r"settings: n_candidates was 2 and is now 3; sampling_steps was 1 and is now 2\."
+    ):
+        Search(tmp_path, str(tmp_path / "study.log"), "test", [2], [0.5], settings=again.trial_settings())
+
+
+def test_an_agent_with_a_planner_put_in_is_saved_with_it(run: Path, tmp_path: Path) -> None:
+    planners = make_planners(run, tmp_path, 2)
+    for depth, temperature in ((2, 0.3), (3, 0.0), (2, 0.7)):
+        planners.put(depth, temperature)
+        planners.model.save(tmp_path / "agent.zip")
+        loaded = SAID.load(tmp_path / "agent.zip", device="cpu")
+        assert loaded.policy.planner.config == planners.model.policy.planner.config
+        assert (loaded.policy.planner.config.depth, loaded.policy.planner.config.temperature) == (depth, temperature)
+        assert loaded.planner_kwargs["depth"] == depth and loaded.policy.planner_updates == 2
+        th.testing.assert_close(loaded.policy.state_dict(), planners.model.policy.state_dict(), rtol=0, atol=0)
+
+
+def test_planners_have_the_runs_settings_whatever_the_defaults_are_then(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = make_planners(run, tmp_path / "before", STEPS)
+    expected.put(1, 0.5)
+    expected.put(2, 0.5)
+    defaults = list(PlannerConfig.__init__.__defaults__)
+    names = [field.name for field in fields(PlannerConfig)]
+    for name, value in {"embed_known": False, "solver": "dpmsolver++2m"}.items():
+        assert defaults[names.index(name)] != value
+        defaults[names.index(name)] = value
+    monkeypatch.setattr(PlannerConfig.__init__, "__defaults__", tuple(defaults))
+    planners = make_planners(run, tmp_path / "after", STEPS)
+    planners.put(1, 0.5)  # the run's own
+    planners.put(2, 0.5)  # trained anew
+    assert planners.config == expected.config
+    assert planners.model.policy.planner.config == expected.model.policy.planner.config
+    ours, theirs = (each.model.policy.planner.state_dict() for each in (planners, expected))
+    th.testing.assert_close(ours, theirs, rtol=0, atol=0)
 
 
 def test_a_claim_has_one_holder_and_outlives_no_process(tmp_path: Path) -> None:

@@ -1,0 +1,33 @@
+"""A task small enough to train whole agents on in a test."""
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from sb3_said import DelayedObservationWrapper
+
+
+class Drift(gym.Env):
+    """The state moves with the action; +1 a step for ``length`` steps, then the episode ends or is cut off."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
+    action_space = spaces.Box(-2.0, 2.0, (1,), np.float32)
+
+    def __init__(self, length=12, truncates=True):
+        self.length, self.truncates = length, truncates
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t, self.state = 0, self.np_random.normal(size=2).astype(np.float32)
+        return self.state.copy(), {}
+
+    def step(self, action):
+        self.t += 1
+        self.state = (0.9 * self.state + 0.1 * np.array([action[0], self.state[0]])).astype(np.float32)
+        end = self.t >= self.length
+        return self.state.copy(), 1.0, end and not self.truncates, end and self.truncates, {}
+
+
+def delayed(delay=2, max_delay=None, **kwargs):
+    """Return the task under a delay; ``kwargs`` are those of ``Drift``."""
+    return DelayedObservationWrapper(Drift(**kwargs), delay, max_delay=max_delay)
