@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 
 import rl_zoo3.train
-import torch as th
 from zoo import ALGORITHMS, PRESETS, DelayedExperimentManager, Run, default_preset, read_arguments
 
 EXAMPLES = """
@@ -51,12 +50,6 @@ def parser() -> argparse.ArgumentParser:
         metavar="STEPS",
         help="steps between checkpoints (default: 25000)",
     )
-    parser.add_argument(
-        "--matmul-precision",
-        choices=("highest", "high", "medium"),
-        default="highest",
-        help="medium: matrix products round their inputs to bfloat16, faster where the CPU has it (%(default)s)",
-    )
     parser.add_argument("--resume", type=Path, metavar="RUN_DIR", help="go on with a run from its last checkpoint")
     return parser
 
@@ -72,7 +65,6 @@ def main(argv: list[str]) -> None:
         options.resume = resume
     if len(options.delay) > 2 or any(x < 0 for x in options.delay):
         parser().error(f"--delay takes N, or LOW HIGH, all >= 0; got {options.delay}")
-    th.set_float32_matmul_precision(options.matmul_precision)
     run = Run(argv, options.delay, options.preset, options.checkpoint_freq, options.resume)
     rl_zoo3.train.ExperimentManager = functools.partial(DelayedExperimentManager, run)  # type: ignore[misc,assignment]
     sys.argv = [sys.argv[0], "--algo", options.algo, *zoo_argv, *(["--help"] if options.help else [])]

@@ -213,7 +213,7 @@ class DelayedReplayBuffer(ReplayBuffer):
         rewards = self._normalize_reward(self.rewards[rows, envs].reshape(-1, 1), env)
         if not self.is_delayed:
             data = (self._normalize_obs(states, env), actions, self._normalize_obs(next_states, env), dones, rewards)
-            return ReplayBufferSamples(*map(self.to_torch, data))
+            return ReplayBufferSamples(*(self.to_torch(np.asarray(part)) for part in data))
 
         ages = self.ages[rows, envs]
         history = self._histories(rows, envs)  # (B, D, act_dim)
@@ -236,6 +236,10 @@ class DelayedReplayBuffer(ReplayBuffer):
             dones=self.to_torch(dones),
             rewards=self.to_torch(rewards),
         )
+
+    def to_torch(self, array: np.ndarray, copy: bool = False) -> th.Tensor:
+        """Hand what was gathered on as a tensor; gathering has copied it, so SB3's second copy is spared."""
+        return super().to_torch(array, copy)
 
     def _successors(self, rows: np.ndarray, envs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return s_{t+1} and its observation's age: (B, obs_dim), (B,)."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import torch as th
@@ -22,7 +22,7 @@ class Windows(NamedTuple):
 
 @dataclass(frozen=True)
 class WindowSource:
-    """Every place a window can start, over arrays that are shared and never copied.
+    """Every place a window can start, over arrays that are shared and, but by :meth:`to`, never copied.
 
     The arrays are laid out as a replay buffer's: ``n_rows`` time steps of ``n_envs`` parallel environments, possibly
     wrapped around. A plain dataset is the case ``n_envs=1``.
@@ -60,22 +60,28 @@ class WindowSource:
 
         :param batch_size: B
         :param length: L, steps of a window
-        :param generator: CPU generator; torch's global one by default
+        :param generator: torch's global one of the CPU by default
         """
-        return self.gather(th.randint(len(self), (batch_size,), generator=generator), length)
+        device = "cpu" if generator is None else generator.device
+        starts = th.randint(len(self), (batch_size,), generator=generator, device=device)
+        return self.gather(starts.to(self.rows.device), length)
 
     def gather(self, starts: th.Tensor, length: int) -> Windows:
         """Return the windows at given starts.
 
-        :param starts: (B,) int64, indices into ``rows``
+        :param starts: (B,) int64, indices into ``rows``, on the arrays' device
         :param length: L, steps of a window
         """
-        steps = th.arange(length)  # (L,)
+        steps = th.arange(length, device=starts.device)  # (L,)
         remaining = self.remaining[starts, None]  # (B, 1)
         offset = th.minimum(steps, remaining - 1)  # (B, L): behind the end, the last row again
         rows = (self.rows[starts, None] + offset) % len(self.states)  # (B, L)
         envs = self.envs[starts, None]  # (B, 1)
         return Windows(self.states[rows, envs], self.actions[rows, envs], steps < remaining, self.values[starts])
+
+    def to(self, device: th.device | str) -> WindowSource:
+        """Return this source over copies of the arrays on a device; where they are there already, over the same."""
+        return WindowSource(**{field.name: getattr(self, field.name).to(device) for field in fields(self)})
 
     def split(self, held_out: float, seed: int = 0) -> tuple[WindowSource, WindowSource]:
         """Split by whole episodes into a training and a held-out source.

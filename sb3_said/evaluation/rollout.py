@@ -165,8 +165,8 @@ def measure_latency(
 ) -> Latency:
     """Time single decisions, from a NumPy observation to a NumPy action, as a control loop asks for them.
 
-    One call warms up and is not counted; every call after it is, slow ones included. The state that ``predict``
-    returns is handed to the next call.
+    A model with a ``warmup`` is warmed up by it, another one by one call that is not counted. Every call after that
+    counts, slow ones included. The state that ``predict`` returns is handed to the next call.
 
     :param model: anything with the ``predict`` of Stable-Baselines3
     :param observations: (M, ...), or a dict of such arrays; call i is asked about observation i mod M
@@ -180,13 +180,17 @@ def measure_latency(
     n_observations = len(next(iter(observations.values())) if isinstance(observations, dict) else observations)
     seconds = np.empty(n_calls + 1)
     state: State = None
-    for call in range(-1, n_calls):
+    first = -1
+    if hasattr(model, "warmup"):
+        model.warmup()
+        first = 0
+    for call in range(first, n_calls):
         observation = _row(observations, call % n_observations)
         began = time.perf_counter()
         if normalize is not None:
             observation = normalize(observation)
         _, state = model.predict(
-            observation, state=state, episode_start=np.array([call == -1]), deterministic=deterministic
+            observation, state=state, episode_start=np.array([call == first]), deterministic=deterministic
         )
         seconds[call + 1] = time.perf_counter() - began
     return Latency.from_seconds(seconds[1:])

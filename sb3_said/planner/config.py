@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from sb3_said.planner import diffusion, dit, inpainting, normalizer, precision
+from sb3_said.common import precision
+from sb3_said.common.checks import check_choice
+from sb3_said.planner import diffusion, dit, inpainting, normalizer
 
 SCORED_STATES = ("future", "decision", "all")
 LR_SCHEDULES = ("cosine", "constant")
@@ -73,7 +75,7 @@ class PlannerConfig:
             ("lr_schedule", LR_SCHEDULES),
             ("precision", precision.PRECISIONS),
         ):
-            diffusion.check_choice(name, getattr(self, name), choices)
+            check_choice(name, getattr(self, name), choices)
         object.__setattr__(self, "betas", tuple(self.betas))  # JSON gives a list back
         at_least = {"depth": 1, "horizon": 2, "sampling_steps": 1, "n_candidates": 1, "batch_size": 1}
         at_least |= {"temperature": 0, "warmup_steps": 0, "weight_decay": 0, "weight_factor": 0, "decision_weight": 0}

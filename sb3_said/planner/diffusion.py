@@ -13,6 +13,8 @@ from typing import NamedTuple
 import numpy as np
 import torch as th
 
+from sb3_said.common.checks import check_choice
+
 START_TIME = 1e-3  # the cleanest time, in training and as the last solver time (CleanDiffuser, and so the paper)
 END_TIMES = {
     "cosine": 0.9946,  # alpha(1) is 0 and could not be divided by; the same stop as DPM-Solver's
@@ -23,15 +25,6 @@ PREDICTIONS = ("v", "epsilon", "x0")
 TIME_SAMPLINGS = ("uniform", "logit_normal")
 SOLVERS = ("ddim", "dpmsolver++2m")
 TIME_GRIDS = ("uniform", "log_snr")
-
-
-def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
-    """Refuse a name that is not among the choices.
-
-    :raises ValueError: saying what was given and what was expected
-    """
-    if value not in choices:
-        raise ValueError(f"{name} is {value!r}, expected one of {tuple(choices)}.")
 
 
 def alpha_sigma(t: th.Tensor, schedule: str) -> tuple[th.Tensor, th.Tensor]:

@@ -24,16 +24,16 @@ def sinusoidal_positions(length: int, d_model: int) -> th.Tensor:
     return th.cat([angles.sin(), angles.cos()], dim=-1)
 
 
-def _modulate(x: th.Tensor, shift: th.Tensor, scale: th.Tensor) -> th.Tensor:
-    """Layer-normalise the tokens, then scale by 1 + scale and shift.
+def _modulate(x: th.Tensor, shift: th.Tensor, factor: th.Tensor) -> th.Tensor:
+    """Layer-normalise the tokens, then scale and shift them.
 
     :param x: (M, L, d_model)
-    :param shift: (M or 1, d_model)
-    :param scale: (M or 1, d_model)
+    :param shift: (M, 1, d_model), or (d_model,) for all
+    :param factor: as ``shift``
     """
-    if len(shift) == 1:  # one time for all: the modulation is the norm's own affine map, one kernel instead of three
-        return F.layer_norm(x, x.shape[-1:], 1 + scale[0], shift[0], eps=1e-6)
-    return F.layer_norm(x, x.shape[-1:], eps=1e-6) * (1 + scale[:, None]) + shift[:, None]
+    if shift.dim() == 1:  # the norm's own affine map: one kernel instead of two
+        return th.layer_norm(x, x.shape[-1:], factor, shift, 1e-6)
+    return th.addcmul(shift, th.layer_norm(x, x.shape[-1:], eps=1e-6), factor)
 
 
 class DiTBlock(nn.Module):
@@ -47,28 +47,35 @@ class DiTBlock(nn.Module):
         super().__init__()
         self.qkv = nn.Linear(d_model, 3 * d_model)
         self.attention_out = nn.Linear(d_model, d_model)
-        self.mlp = nn.Sequential(
-            nn.Linear(d_model, 4 * d_model), nn.GELU(approximate="tanh"), nn.Linear(4 * d_model, d_model)
-        )
+        # Exact: the tanh in the public code approximates it to 5e-4, and takes four times as long on a CPU
+        self.mlp = nn.Sequential(nn.Linear(d_model, 4 * d_model), nn.GELU(), nn.Linear(4 * d_model, d_model))
 
-    def forward(self, x: th.Tensor, modulation: th.Tensor, attend: th.Tensor | None = None) -> th.Tensor:
-        """
-        :param x: (M, L, d_model)
-        :param modulation: (M or 1, 6, d_model): shift, scale and gate of the attention, then of the MLP
-        :param attend: (M, 1, 1, L) bool, the tokens that may be attended to; all by default
-        """
-        shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = modulation.unbind(1)  # each (M or 1, d_model)
-        x = x + gate_a[:, None] * self._attention(_modulate(x, shift_a, scale_a), attend)
-        return x + gate_m[:, None] * self.mlp(_modulate(x, shift_m, scale_m))
+    def forward(
+        self, x: th.Tensor, modulation: tuple[th.Tensor, ...], attention_bias: th.Tensor | None = None
+    ) -> th.Tensor:
+        """Return the residual stream behind the block: (M, L, d_model) float32, whatever the weights' number format.
 
-    def _attention(self, x: th.Tensor, attend: th.Tensor | None) -> th.Tensor:
-        q, k, v = self.qkv(x).unflatten(-1, (3, -1, HEAD_DIM)).permute(2, 0, 3, 1, 4)  # each (M, heads, L, HEAD_DIM)
-        # Plain products: windows are short, and the fused kernel's backward pass on CPUs costs more than all else.
-        scores = (q * HEAD_DIM**-0.5) @ k.transpose(-1, -2)  # (M, heads, L, L)
-        if attend is not None:
-            scores = scores.masked_fill(~attend, -th.inf)
-        mixed = scores.softmax(-1).to(v.dtype) @ v  # (M, heads, L, HEAD_DIM)
-        return self.attention_out(mixed.transpose(1, 2).flatten(2))
+        :param x: (M, L, d_model) float32
+        :param modulation: shift, factor and gate of the attention, then of the MLP: 6 of (M, 1, d_model), or of
+            (d_model,) for all
+        :param attention_bias: (M, 1, 1, L) float32, -inf for tokens that may not be attended to; 0 by default
+        """
+        shift_a, factor_a, gate_a, shift_m, factor_m, gate_m = modulation
+        dtype = self.qkv.weight.dtype
+        attended = self._attention(_modulate(x, shift_a, factor_a).to(dtype), attention_bias)
+        x = th.addcmul(x, gate_a, attended)
+        return th.addcmul(x, gate_m, self.mlp(_modulate(x, shift_m, factor_m).to(dtype)))
+
+    def _attention(self, x: th.Tensor, bias: th.Tensor | None) -> th.Tensor:
+        m, length, d_model = x.shape
+        qkv = self.qkv(x).view(m, length, 3, -1, HEAD_DIM).permute(2, 0, 3, 1, 4).contiguous()
+        q, k, v = qkv.view(3, -1, length, HEAD_DIM).unbind()  # each (M * heads, L, HEAD_DIM)
+        # Plain products: windows are short, and PyTorch's fused attention costs CPUs more in both directions.
+        scores = th.baddbmm(q.new_empty(1), q, k.mT, beta=0, alpha=HEAD_DIM**-0.5)  # (M * heads, L, L)
+        if bias is not None:
+            scores = (scores.view(m, -1, length, length) + bias).view(-1, length, length)
+        mixed = th.bmm(scores.softmax(-1, dtype=th.float32).to(v.dtype), v)  # (M * heads, L, HEAD_DIM)
+        return self.attention_out(mixed.view(m, -1, length, HEAD_DIM).transpose(1, 2).reshape(m, length, d_model))
 
 
 class DiT1d(nn.Module):
@@ -89,6 +96,7 @@ class DiT1d(nn.Module):
     """
 
     frequencies: th.Tensor
+    is_factor: th.Tensor
 
     def __init__(
         self,
@@ -117,6 +125,8 @@ class DiT1d(nn.Module):
         self.modulation = nn.Linear(d_model, (6 * depth + 2) * d_model)
         self.blocks = nn.ModuleList(DiTBlock(d_model) for _ in range(depth))
         self.out = nn.Linear(d_model, obs_dim + act_dim)
+        is_factor = th.tensor([0.0, 1.0, 0.0] * (2 * depth) + [0.0, 1.0])[:, None]  # (6 * depth + 2, 1)
+        self.register_buffer("is_factor", is_factor, persistent=False)
         # Periods of 4 to 1/16 of the diffusion time: smooth enough for few steps, fine enough near t = 0
         self.register_buffer("frequencies", 2 * math.pi * 2 ** th.linspace(-2.0, 4.0, N_TIME_FEATURES // 2))
         for module in self.modules():
@@ -136,12 +146,14 @@ class DiT1d(nn.Module):
     def modulations(self, t: th.Tensor) -> th.Tensor:
         """Return what the time changes in every layer: (n, 6 * depth + 2, d_model) float32.
 
-        :param t: (n,) float32 diffusion times, one per window, or a single one for all windows
+        Of each block shift, factor and gate of the attention, then of the MLP; at last shift and factor of the output.
+
+        :param t: (n,) float32 diffusion times
         """
         angles = t[:, None] * self.frequencies  # (n, N_TIME_FEATURES / 2)
         embedded = self.time_embedding(th.cat([angles.cos(), angles.sin()], dim=-1))  # (n, d_model)
         rows = self.modulation(F.silu(embedded)).unflatten(-1, (-1, self.d_model))
-        return rows.float()  # the residual stream they act on is float32, also under autocast
+        return rows + self.is_factor  # adaLN-zero predicts factors less 1. In float32, as the stream they act on
 
     def context(self, window: th.Tensor, known: th.Tensor) -> th.Tensor:
         """Return what is added to the tokens because of their place and of what is known: (B, L, d_model).
@@ -149,7 +161,8 @@ class DiT1d(nn.Module):
         :param window: (B, L, obs_dim + act_dim), normalised; only known entries are read
         :param known: (B, L, obs_dim + act_dim) bool known mask
         """
-        flags = known[..., [0, self.obs_dim]].to(window.dtype)  # (B, L, 2): state known, action known
+        flags = th.stack((known[..., 0], known[..., self.obs_dim]), dim=-1)  # (B, L, 2): state known, action known
+        flags = flags.to(window.dtype)
         added = self.flag_embedding(flags) + self.positions
         if self.known_embedding is None:
             return added
@@ -165,15 +178,19 @@ class DiT1d(nn.Module):
 
         :param x: (B * N, L, obs_dim + act_dim) noisy windows, known entries clean; N in a row share a context
         :param context: (B, L, d_model), from :meth:`context`
-        :param modulations: (B * N or 1, 6 * depth + 2, d_model), from :meth:`modulations`
+        :param modulations: (B * N, 6 * depth + 2, d_model), from :meth:`modulations`, or (6 * depth + 2, d_model) of
+            one time for all
         :param valid: (B * N, L) bool, the tokens that may be attended to; all by default
         """
         tokens = self.token_embedding(x).unflatten(0, (len(context), -1)) + context[:, None]  # (B, N, L, d_model)
         tokens = tokens.flatten(0, 1)
-        attend = None if valid is None else valid[:, None, None, :]  # (B * N, 1, 1, L)
+        bias = None if valid is None else th.where(valid, 0.0, -th.inf)[:, None, None]  # (B * N, 1, 1, L)
+        if modulations.dim() == 3:
+            modulations = modulations.transpose(0, 1)[:, :, None]  # (6 * depth + 2, B * N, 1, d_model)
+        parts = modulations.unbind()  # at once: the gradient of each slice would be as large as all modulations
         for i, block in enumerate(self.blocks):
-            tokens = block(tokens, modulations[:, 6 * i : 6 * i + 6], attend)
-        return self.out(_modulate(tokens, modulations[:, -2], modulations[:, -1]))
+            tokens = block(tokens, parts[6 * i : 6 * i + 6], bias)
+        return self.out(_modulate(tokens, parts[-2], parts[-1]).to(self.out.weight.dtype))
 
 
 def _mlp(n_in: int, d_model: int) -> nn.Sequential:

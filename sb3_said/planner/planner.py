@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
+from functools import partial
 from typing import NamedTuple
 
 import torch as th
 from torch import nn
 
+from sb3_said.common.precision import autocast, compute_dtype
 from sb3_said.common.windows import Windows
 from sb3_said.planner import diffusion, inpainting
 from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.dit import DiT1d
 from sb3_said.planner.normalizer import Normalizer
-from sb3_said.planner.precision import autocast
+from sb3_said.planner.sampling import Prepared, SamplingCache, addresses, is_frozen
 
 ValueFn = Callable[[th.Tensor, th.Tensor], th.Tensor]
 
@@ -66,6 +68,7 @@ class InpaintingPlanner(nn.Module):
         self.normalizer = Normalizer(
             obs_dim, act_dim, self.window_length, config.action_transform, config.relative_states
         )
+        self._cache = SamplingCache()
 
     @property
     def device(self) -> th.device:
@@ -73,7 +76,7 @@ class InpaintingPlanner(nn.Module):
         return self.normalizer.state_mean.device
 
     def autocast(self) -> AbstractContextManager[object]:
-        """Return the context of ``config.precision`` here; :meth:`loss` and :meth:`plan` enter it themselves."""
+        """Return the context of ``config.precision`` here; :meth:`loss` enters it itself."""
         return autocast(self.config.precision, self.device)
 
     def fit_normalizer(self, states: th.Tensor, actions: th.Tensor, windows: Windows | None = None) -> None:
@@ -108,7 +111,7 @@ class InpaintingPlanner(nn.Module):
         :param weight: (B,) factor of each window's error; 1 by default
         :param generator: of mask lengths, noise and times; torch's global one by default
         :return: float32 scalar
-        :raises ValueError: for windows of another shape or delays outside 0..max_delay
+        :raises ValueError: for windows of another shape or delays outside 0..max_delay (on a GPU, delays are not read)
         """
         config, device = self.config, self.device
         states, actions = self._tensor(windows.states), self._tensor(windows.actions)
@@ -119,7 +122,8 @@ class InpaintingPlanner(nn.Module):
             _check_shape("weight", weight := self._tensor(weight), (n,))
         if delay is None:
             delay = inpainting.draw_delays(n, self.max_delay, config.mask, config.mask_end_probability, generator)
-        delay = self._delay(delay, n)
+        # Delays on a GPU are not read back: every update would wait for it, and a recorded one could not
+        delay = self._delay(delay, n) if delay.device.type == "cpu" else delay
         valid = windows.valid.to(device)  # (B, L)
         clean = self.normalizer.normalize(states, actions)  # (B, L, obs_dim + act_dim)
         # Steps behind an episode's end repeat its last row: they are neither shown as known nor learned
@@ -158,6 +162,12 @@ class InpaintingPlanner(nn.Module):
         The arguments that default to ``None`` take the config's value. One candidate is enough, and drawn, where the
         others could not matter: at temperature 0, where all are alike, and by default without a ``value_fn``.
 
+        Freeze a trained planner with ``requires_grad_(False)``: only then is what depends on the weights alone kept
+        from one call to the next. On a GPU its whole decision is one CUDA graph, made at the first call with these
+        sizes and settings, if the ``value_fn`` is a module or a method of one, which must then never wait for the
+        device. Any other ``value_fn`` may read what a graph would not see change: its plans are made operation by
+        operation.
+
         :param observation: (B, obs_dim) delayed observations s_{t-d}
         :param action_history: (B, D, act_dim), the D newest actions, oldest first
         :param delay: (B,) integers d in 0..D, not necessarily alike
@@ -176,6 +186,7 @@ class InpaintingPlanner(nn.Module):
         n = len(observation)
         _check("action_history", action_history, (n, self.max_delay, self.act_dim))
         delay = self._delay(delay, n)
+        skipped = 1 + int(delay.min())  # states that no decision scores need no value
         temperature = config.temperature if temperature is None else temperature
         shape = (length, self.obs_dim + self.act_dim)
         if noise is not None:
@@ -196,30 +207,63 @@ class InpaintingPlanner(nn.Module):
             config.time_grid,
         )
 
-        given = inpainting.known_window(observation, action_history, delay, length)  # (B, L, obs_dim + act_dim)
-        known = inpainting.known_mask(delay, length, self.obs_dim, self.act_dim)
-        clean, network = self.normalizer.normalize(*self._split(given)), self.network
         if noise is None:
             noise = self._noise((n, n_candidates, *shape), generator)
         x = temperature * noise[..., :n_candidates, :, :].expand(n, -1, -1, -1)  # (B, N, L, obs_dim + act_dim)
-        with self.autocast():
-            modulations = network.modulations(th.tensor([step.t for step in steps], device=self.device))
-            context = network.context(clean, known)
-            x = diffusion.solve(
-                lambda x, i: network(x.flatten(0, 1), context, modulations[i : i + 1]).float().view_as(x),
-                x,
-                steps,
-                config.prediction,
-                impose=lambda x: th.where(known[:, None], clean[:, None], x),
-            )
+        prepared = self._cache.prepare(self, self.network, steps, compute_dtype(config.precision, self.device))
+        inputs = (observation, action_history, delay, x)
+        if self._can_be_graphed(value_fn):
+            key = (config, tuple(x.shape), value_fn, addresses(self if value_fn is None else _owner(value_fn)))
+            graph = self._cache.graph(key, partial(self._inpaint, prepared, steps, value_fn, 1), inputs)
+            plan = Plan(*graph(*inputs))
+        else:
+            plan = self._inpaint(prepared, steps, value_fn, skipped, *inputs)
+        if plan.values.isnan().any():
+            raise ValueError("value_fn returned NaN, so that no candidate is the best; check the critic.")
+        return plan
+
+    def _can_be_graphed(self, value_fn: ValueFn | None) -> bool:
+        is_module = value_fn is None or isinstance(_owner(value_fn), nn.Module)
+        return self.device.type == "cuda" and is_module and is_frozen(self)
+
+    def _inpaint(
+        self,
+        prepared: Prepared,
+        steps: Sequence[diffusion.SolverStep],
+        value_fn: ValueFn | None,
+        skipped: int,
+        observation: th.Tensor,
+        action_history: th.Tensor,
+        delay: th.Tensor,
+        x: th.Tensor,
+    ) -> Plan:
+        """Go from what is known and initial noise to the decision, without waiting for the device on the way.
+
+        :param skipped: states at a window's beginning that are not scored at any of the delays
+        :param x: (B, N, L, obs_dim + act_dim) initial noise, scaled
+        """
+        given = inpainting.known_window(observation, action_history, delay, self.window_length)
+        known = inpainting.known_mask(delay, self.window_length, self.obs_dim, self.act_dim)
+        clean = self.normalizer.normalize(*self._split(given))  # (B, L, obs_dim + act_dim), as given and known
+        network, modulations = prepared
+        context = network.context(clean, known)
+        x = diffusion.solve(
+            lambda x, i: network(x.flatten(0, 1), context, modulations[i]).float().view_as(x),
+            x,
+            steps,
+            self.config.prediction,
+            impose=lambda x: th.where(known[:, None], clean[:, None], x),
+        )
         # What is given comes back exactly as given, without the rounding of the normaliser
         x = th.where(known[:, None], given[:, None], th.cat(self.normalizer.denormalize(x), dim=-1))
         states, actions = self._split(x)
-        values = self._values(states, actions, delay, value_fn)  # (B, N)
-        rows = th.arange(n, device=self.device)
+        values = self._values(states, actions, delay, value_fn, skipped)  # (B, N)
+        rows = th.arange(len(x), device=x.device)
         return Plan(actions[rows, values.argmax(1), delay], states, actions, values)
 
-    def _values(self, states: th.Tensor, actions: th.Tensor, delay: th.Tensor, value_fn: ValueFn | None) -> th.Tensor:
+    def _values(
+        self, states: th.Tensor, actions: th.Tensor, delay: th.Tensor, value_fn: ValueFn | None, skipped: int
+    ) -> th.Tensor:
         """Return the mean value of each candidate's scored states: (B, N)."""
         if value_fn is None:
             return th.zeros(states.shape[:2], device=self.device)
@@ -227,17 +271,17 @@ class InpaintingPlanner(nn.Module):
             rows = th.arange(len(delay), device=self.device)
             present = states[rows, :, delay].mean(1, keepdim=True).expand(-1, states.shape[1], -1)  # (B, N, obs_dim)
             states, actions = present[:, :, None], actions[rows, :, delay][:, :, None]  # windows of one step
-            delay = th.full_like(delay, -1)  # so that the one step counts as behind the decision index
-        first = th.ones_like(delay) if self.config.scored_states == "all" else 1 + delay  # (B,)
-        skipped = int(first.min())  # states that no decision scores need no value
+            skipped, first = 0, th.zeros_like(delay)
+        elif self.config.scored_states == "all":
+            skipped, first = 1, th.ones_like(delay)
+        else:
+            first = 1 + delay  # (B,)
         values = value_fn(states[:, :, skipped:], actions[:, :, skipped:]).float()  # (B, N, L - skipped)
         if values.shape != (*states.shape[:2], states.shape[2] - skipped):
             raise ValueError(
                 f"value_fn returned the shape {tuple(values.shape)}, expected one value per state, "
                 f"{(*states.shape[:2], states.shape[2] - skipped)}: drop a last dimension of 1."
             )
-        if values.isnan().any():
-            raise ValueError("value_fn returned NaN, so that no candidate is the best; check the critic.")
         steps = th.arange(skipped, states.shape[2], device=self.device)
         scored = (steps >= first[:, None])[:, None]  # (B, 1, L - skipped)
         return th.where(scored, values, 0.0).sum(-1) / scored.sum(-1)
@@ -267,6 +311,11 @@ class InpaintingPlanner(nn.Module):
                 "planner with a larger max_delay."
             )
         return delay.to(self.device, th.int64)
+
+
+def _owner(value_fn: ValueFn) -> object:
+    """Return the object whose method a function is, or the function."""
+    return getattr(value_fn, "__self__", value_fn)
 
 
 def _check_shape(name: str, values: th.Tensor, shape: tuple[int | None, ...]) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import torch as th
 
 from sb3_said.common.windows import Windows, WindowSource
+from sb3_said.planner.capture import CapturedStep
 from sb3_said.planner.config import SAMPLING_SETTINGS, PlannerConfig
 from sb3_said.planner.inpainting import draw_delays
 from sb3_said.planner.planner import InpaintingPlanner
@@ -53,8 +54,11 @@ class PlannerTrainer:
     exponential moving average after every update, so it can be used, saved and evaluated between any two of them.
 
     All draws come from a generator of the trainer's own, and on the CPU a run that was saved and resumed ends bit for
-    bit as if it had never stopped (a GPU's attention does not repeat itself exactly). A small regression is trained on
+    bit as if it had never stopped (a GPU's sums do not repeat themselves exactly). A small regression is trained on
     the same batches, as the bar for the planner's errors.
+
+    On a GPU the data is copied there once, the draws are made there, and from the fourth update on a whole update is
+    one recorded graph. No update waits for the device; losses are read at log times.
 
     :param planner: trained in place; its normaliser is fitted to the training part of ``source``
     :param source: windows of the true, undelayed states and the actions
@@ -87,7 +91,8 @@ class PlannerTrainer:
         self.gradient_steps = gradient_steps
         self.n_updates = 0
         self.device = planner.device
-        self.generator = th.Generator().manual_seed(seed)
+        on_gpu = self.device.type == "cuda"
+        self.generator = th.Generator(self.device if on_gpu else "cpu").manual_seed(seed)
         self._settings = _plain(
             {
                 "config": dataclasses.asdict(planner.config),
@@ -98,28 +103,32 @@ class PlannerTrainer:
             }
         )
 
-        self.source, held_source = source.split(held_out, seed) if held_out > 0 else (source, None)
+        training_source, held_source = source.split(held_out, seed) if held_out > 0 else (source, None)
+        self.source = training_source.to(self.device)
         windows = self.source.sample(N_NORMALIZER_WINDOWS, planner.window_length, self.generator)
         planner.fit_normalizer(self.source.start_states(), self.source.start_actions(), windows)
         self.online = copy.deepcopy(planner).train().requires_grad_(True)
         with th.random.fork_rng(devices=[]):  # the initial weights are the only draw that takes no generator
             th.manual_seed(seed)
             self.yardstick = RegressionYardstick(planner.obs_dim, planner.act_dim, planner.max_delay).to(self.device)
-        fused = self.device.type in ("cpu", "cuda")
+        fused: dict[str, Any] = {"fused": on_gpu or self.device.type == "cpu", "capturable": on_gpu}
         self.optimizer = th.optim.AdamW(
             self.online.parameters(),
-            lr=self.config.learning_rate,
+            lr=self._rate(self.config.learning_rate),
             betas=self.config.betas,
             weight_decay=self.config.weight_decay,
-            fused=fused,
+            **fused,
         )
-        self.yardstick_optimizer = th.optim.Adam(self.yardstick.parameters(), lr=YARDSTICK_LEARNING_RATE, fused=fused)
+        self.yardstick_optimizer = th.optim.Adam(
+            self.yardstick.parameters(), lr=self._rate(YARDSTICK_LEARNING_RATE), **fused
+        )
         self._averaged: list[th.Tensor] = list(planner.parameters())
         self._online: list[th.Tensor] = list(self.online.parameters())
         # Read at log times only: a read per update would make a GPU wait for it.
         self._loss_sums = th.zeros(2, device=self.device)
         self._n_losses = 0
         self._bad_update = th.full((), -1, device=self.device)
+        self._captured = CapturedStep(self._descend, self.generator) if on_gpu else None
         self._held_out = None if held_source is None else self._draw_held_out(held_source, seed)
 
     def step(self) -> None:
@@ -127,41 +136,48 @@ class PlannerTrainer:
 
         :raises FloatingPointError: when a loss was not finite (looked at every 100 updates)
         """
-        config = self.config
-        windows = self._to_device(self.source.sample(config.batch_size, self.planner.window_length, self.generator))
-        delay = draw_delays(
-            config.batch_size, self.planner.max_delay, config.mask, config.mask_end_probability, self.generator
-        )  # (B,)
-        rate = learning_rate(self.n_updates, self.gradient_steps, config)
-        for optimizer, factor in (
-            (self.optimizer, 1.0),
-            (self.yardstick_optimizer, YARDSTICK_LEARNING_RATE / config.learning_rate),
-        ):
-            for group in optimizer.param_groups:
-                group["lr"] = rate * factor
-            optimizer.zero_grad()
+        rate = learning_rate(self.n_updates, self.gradient_steps, self.config)
+        self._set_rate(self.optimizer, rate)
+        self._set_rate(self.yardstick_optimizer, rate * YARDSTICK_LEARNING_RATE / self.config.learning_rate)
+        losses = self._captured() if self._captured is not None else self._descend()  # (2,)
+        with th.no_grad():  # not recorded, as a replay would not tell the planner's sampling cache of new weights
+            th._foreach_lerp_(self._averaged, self._online, 1.0 - ema_decay(self.n_updates, self.config))
+            self._loss_sums += losses
+            is_first_bad = ~losses[0].isfinite() & (self._bad_update < 0)
+            self._bad_update.masked_fill_(is_first_bad, self.n_updates)
+        self._n_losses += 1
+        self.n_updates += 1
+        if self.n_updates % 100 == 0:
+            self._check_finite()
 
+    def _descend(self) -> th.Tensor:
+        """Draw a batch and move the online weights and the yardstick's, reading no number off the device.
+
+        :return: (2,) float32, the planner's loss and the yardstick's
+        """
+        config = self.config
+        self.optimizer.zero_grad()
+        self.yardstick_optimizer.zero_grad()
+        windows = self.source.sample(config.batch_size, self.planner.window_length, self.generator)
+        delay = draw_delays(
+            config.batch_size,
+            self.planner.max_delay,
+            config.mask,
+            config.mask_end_probability,
+            self.generator,
+            self.device,
+        )  # (B,)
         weight = value_weight(windows.values, config.weight_factor)  # (B,)
         loss = self.online.loss(windows, delay, weight, self.generator)
         loss.backward()
         if config.gradient_clip is not None:
             th.nn.utils.clip_grad_norm_(self._online, config.gradient_clip)
         self.optimizer.step()
-        with th.no_grad():
-            th._foreach_lerp_(self._averaged, self._online, 1.0 - ema_decay(self.n_updates, config))
 
-        yardstick_loss = self.yardstick.loss(*self._yardstick_batch(windows, delay.to(self.device)), weight)
+        yardstick_loss = self.yardstick.loss(*self._yardstick_batch(windows, delay), weight)
         yardstick_loss.backward()
         self.yardstick_optimizer.step()
-
-        with th.no_grad():
-            self._loss_sums += th.stack((loss.float(), yardstick_loss))
-            is_first_bad = ~loss.isfinite() & (self._bad_update < 0)
-            self._bad_update.masked_fill_(is_first_bad, self.n_updates)
-        self._n_losses += 1
-        self.n_updates += 1
-        if self.n_updates % 100 == 0:
-            self._check_finite()
+        return th.stack((loss, yardstick_loss)).detach()
 
     def train(
         self, n_steps: int | None = None, callback: Callable[[PlannerTrainer], bool | None] | None = None
@@ -184,7 +200,7 @@ class PlannerTrainer:
         loss, yardstick_loss = (self._loss_sums / max(1, self._n_losses)).tolist()
         self._loss_sums.zero_()
         self._n_losses = 0
-        rate = self.optimizer.param_groups[0]["lr"]
+        rate = float(self.optimizer.param_groups[0]["lr"])
         return {"planner/loss": loss, "planner/loss_mlp": yardstick_loss, "planner/learning_rate": rate}
 
     @th.no_grad()
@@ -258,6 +274,20 @@ class PlannerTrainer:
         self._loss_sums.copy_(state["loss_sums"])
         self._n_losses = state["n_losses"]
         self._bad_update.fill_(-1)
+        if self._captured is not None:
+            self._captured.forget()  # it writes to the optimizer state that was replaced
+
+    def _rate(self, rate: float) -> float | th.Tensor:
+        """Return a learning rate as the optimizers take it: on a GPU a tensor, so that a recorded update reads it."""
+        return th.tensor(rate, device=self.device) if self.device.type == "cuda" else rate
+
+    @staticmethod
+    def _set_rate(optimizer: th.optim.Optimizer, rate: float) -> None:
+        for group in optimizer.param_groups:
+            if isinstance(group["lr"], th.Tensor):
+                group["lr"].fill_(rate)
+            else:
+                group["lr"] = rate
 
     def _check_finite(self) -> None:
         bad = int(self._bad_update)

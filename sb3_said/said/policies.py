@@ -6,8 +6,10 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields
+from itertools import product
 from typing import Any, Literal
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
@@ -92,7 +94,7 @@ class SAIDPolicy(DelayedSACPolicy):
         """
         flat = states.flatten(0, -2)
         observation: PyTorchObs = flat if self.replay_space is None else {UNDELAYED: flat}
-        return th.cat(self.critic(observation, actions.flatten(0, -2)), dim=1).amin(1).view(states.shape[:-1])
+        return self.critic.q_values(observation, actions.flatten(0, -2)).amin(0).view(states.shape[:-1])
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         who = self._answer or ("planner" if self.planner_is_trained else "expert")
@@ -135,6 +137,28 @@ class SAIDPolicy(DelayedSACPolicy):
         seed = zlib.crc32(b"".join(entry.cpu().numpy().tobytes() for entry in entries))
         shape = (planner.config.n_candidates, planner.window_length, planner.obs_dim + planner.act_dim)
         return th.randn(shape, generator=th.Generator().manual_seed(seed))
+
+    def warmup(self, batch_size: int = 1) -> None:
+        """Answer a few times for nothing, so that the first answer after it takes no longer than any other.
+
+        Modulations, weights in bfloat16, the CPU's choice of kernels and a GPU's graph are made at a first answer.
+
+        :param batch_size: observations of a later ``predict``
+        :raises ValueError: for a batch_size below 1
+        """
+        if batch_size < 1:
+            raise ValueError(f"batch_size is {batch_size}, expected at least 1.")
+        space = self.observation_space
+        parts = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
+        arrays = {key: np.zeros((batch_size, *(part.shape or ())), np.float32) for key, part in parts.items()}
+        devices = [self.device] if self.device.type == "cuda" else []
+        with th.random.fork_rng(devices=devices):  # who draws actions afterwards draws the same
+            for delay, deterministic in product((0, self.max_delay), (True, False, True)):
+                if "delay" in arrays:
+                    arrays["delay"][:] = delay
+                self.predict(
+                    arrays if isinstance(space, spaces.Dict) else arrays["observation"], None, None, deterministic
+                )
 
     def set_training_mode(self, mode: bool) -> None:
         super().set_training_mode(mode)

@@ -137,6 +137,13 @@ class SAID(DelayedSAC):
         self.planner_kwargs = {**(self.planner_kwargs or {}), **settings}
         self.policy.planner_kwargs = {**self.policy.planner_kwargs, **settings}
 
+    def warmup(self, batch_size: int = 1) -> None:
+        """Answer a few times for nothing: see :meth:`SAIDPolicy.warmup`. A control loop calls it once before it starts.
+
+        :param batch_size: observations of a later ``predict``
+        """
+        self.policy.warmup(batch_size)
+
     def make_planner_trainer(self, gradient_steps: int | None = None) -> PlannerTrainer:
         """Return a trainer of this agent's planner on its replay buffer.
 

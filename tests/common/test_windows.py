@@ -243,3 +243,21 @@ def test_sample_windows_of_the_buffer():
         np.testing.assert_array_equal(states, expected_states)
         np.testing.assert_array_equal(actions, expected_actions)
         assert valid.sum() == n_valid
+
+
+def test_moving_to_where_it_is_copies_nothing():
+    source = make_source([2, 3])
+    moved = source.to("cpu")
+    for name in ("states", "actions", "rows", "envs", "remaining", "values", "episodes"):
+        assert getattr(moved, name) is getattr(source, name)
+
+
+@pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
+def test_windows_of_a_gpu_are_those_of_the_cpu():
+    source = make_source([2, 9, 4])
+    on_gpu = source.to("cuda")
+    starts = th.arange(len(source))
+    for a, b in zip(source.gather(starts, 4), on_gpu.gather(starts.cuda(), 4), strict=True):
+        assert b.is_cuda and th.equal(a, b.cpu())
+    drawn = on_gpu.sample(64, 4, th.Generator("cuda").manual_seed(0))
+    assert drawn.states.is_cuda and len(drawn.states[:, 0].unique(dim=0)) > 10

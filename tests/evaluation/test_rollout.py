@@ -165,3 +165,20 @@ def test_latency_counts_every_call_but_the_warm_up() -> None:
     assert latency.p50_ms < 15 and 20 <= latency.max_ms
     with pytest.raises(ValueError, match="at least 1"):
         measure_latency(model, observations, n_calls=0)
+
+
+def test_latency_counts_the_first_call_of_a_model_that_warms_up() -> None:
+    class Warm(Model):
+        ready = False
+
+        def warmup(self) -> None:
+            self.ready = True
+
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            assert self.ready
+            return super().predict(observation, state, episode_start)
+
+    model = Warm()
+    observations = collect_observations(lambda: AsDict(Countdown()), 7, seed=0)
+    latency = measure_latency(model, observations, n_calls=20)
+    assert latency.n_calls == 20 and model.batches == [1] * 20

@@ -53,14 +53,14 @@ def test_untrained_output_is_zero_but_learns(positions, embed_known):
 
 def test_block_is_the_identity_while_its_gates_are_closed():
     block, x = DiTBlock(64), 3 + 5 * th.randn(4, LENGTH, 64)
-    modulation = th.randn(4, 6, 64)
+    modulation = th.randn(4, 6, 1, 64)
     modulation[:, [2, 5]] = 0.0
-    assert th.equal(block(x, modulation), x)
+    assert th.equal(block(x, modulation.unbind(1)), x)
     # and adds to the very same stream when they open: the sum is linear in a gate
     outputs = []
     for gate in (1.0, 2.0):
         modulation[:, 2] = gate
-        outputs.append(block(x, modulation) - x)
+        outputs.append(block(x, modulation.unbind(1)) - x)
     th.testing.assert_close(outputs[1], 2 * outputs[0], atol=1e-4, rtol=1e-4)
 
 
@@ -111,7 +111,7 @@ def test_sharing_modulations_and_contexts_changes_nothing():
         ]
     )
     context = network.context(x[[0, 3]], known[[0, 3]])  # each for three windows in a row
-    shared = network(x, context, network.modulations(th.tensor([0.3])))
+    shared = network(x, context, network.modulations(th.tensor([0.3]))[0])
     each = network(x, context, network.modulations(th.full((6,), 0.3)))
     th.testing.assert_close(shared, alone, atol=1e-5, rtol=1e-5)
     th.testing.assert_close(each, alone, atol=1e-5, rtol=1e-5)

@@ -8,8 +8,9 @@ import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sb3_said.common import precision
 from sb3_said.common.windows import Windows
-from sb3_said.planner import InpaintingPlanner, PlannerConfig, precision
+from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner.diffusion import alpha_sigma, draw_times
 from sb3_said.planner.normalizer import Normalizer
 

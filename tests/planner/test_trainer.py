@@ -12,17 +12,22 @@ import torch as th
 from linear_system import ACTION_DIM, STATE_DIM, make_source
 
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
+from sb3_said.planner.diffusion import alpha_sigma, draw_times
+from sb3_said.planner.dit import HEAD_DIM
+from sb3_said.planner.inpainting import draw_delays
 from sb3_said.planner.trainer import PlannerTrainer, ema_decay, learning_rate, value_weight
 
 D = 3
 
 
-def make_trainer(gradient_steps=12, held_out=0.1, seed=0, source=None, max_delay=D, **config) -> PlannerTrainer:
+def make_trainer(
+    gradient_steps=12, held_out=0.1, seed=0, source=None, max_delay=D, device="cpu", **config
+) -> PlannerTrainer:
     defaults = dict(depth=1, d_model=32, horizon=3, batch_size=16, warmup_steps=4, learning_rate=1e-3, sampling_steps=2)
     with th.random.fork_rng(devices=[]):
         th.manual_seed(seed)
         planner = InpaintingPlanner(STATE_DIM, ACTION_DIM, max_delay, PlannerConfig(**{**defaults, **config}))
-    return PlannerTrainer(planner, source or make_source(40, 20), gradient_steps, held_out, seed)
+    return PlannerTrainer(planner.to(device), source or make_source(40, 20), gradient_steps, held_out, seed)
 
 
 def leaves(tree, path=""):
@@ -96,6 +101,137 @@ def test_planner_holds_the_average_of_the_online_weights():
         th.testing.assert_close(averaged, mean)
     online = th.cat([parameter.detach().flatten() for parameter in trainer.online.parameters()])
     assert (th.cat([mean.flatten() for mean in naive]) - online).abs().max() > 1e-5
+
+
+# ------------------------------------------------------------------------------------------- a step the slow way
+
+
+def layer_norm(x):
+    centred = x - x.mean(-1, keepdim=True)
+    return centred / (centred.pow(2).mean(-1, keepdim=True) + 1e-6).sqrt()
+
+
+def naive_attention(block, x):
+    """Attend token by token and head by head; x is (L, d_model), of valid tokens alone."""
+    q, k, v = (x @ block.qkv.weight.T + block.qkv.bias).chunk(3, dim=-1)
+    heads = []
+    for h in range(0, x.shape[1], HEAD_DIM):
+        mixed = []
+        for query in q[:, h : h + HEAD_DIM]:
+            score = th.stack([query @ key for key in k[:, h : h + HEAD_DIM]]) / math.sqrt(HEAD_DIM)
+            weight = score.exp() / score.exp().sum()
+            mixed.append(sum(w * value for w, value in zip(weight, v[:, h : h + HEAD_DIM], strict=True)))
+        heads.append(th.stack(mixed))
+    return block.attention_out(th.cat(heads, dim=-1))
+
+
+def naive_network(network, x, known, t):
+    """Predict one window; x is (n_valid, obs_dim + act_dim)."""
+    angles = t * network.frequencies
+    embedded = network.time_embedding(th.cat([angles.cos(), angles.sin()]))
+    parts = network.modulation(embedded * embedded.sigmoid()).view(-1, network.d_model)
+    flags = known[:, [0, network.obs_dim]].to(x.dtype)
+    D, given = network.max_delay, th.where(known, x, 0.0)
+    history, shown = (  # steps behind an episode's end are not known
+        th.nn.functional.pad(part[:D], (0, 0, 0, D - len(part[:D])))
+        for part in (given[:, network.obs_dim :], flags[:, 1:])
+    )
+    summary = network.known_embedding(th.cat([given[0, : network.obs_dim], history.flatten(), shown.flatten()]))
+    tokens = network.token_embedding(x) + network.flag_embedding(flags) + network.positions[: len(x)] + summary
+    for i, block in enumerate(network.blocks):
+        shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = parts[6 * i : 6 * i + 6]
+        tokens = tokens + gate_a * naive_attention(block, layer_norm(tokens) * (1 + scale_a) + shift_a)
+        tokens = tokens + gate_m * block.mlp(layer_norm(tokens) * (1 + scale_m) + shift_m)
+    return network.out(layer_norm(tokens) * (1 + parts[-1]) + parts[-2])
+
+
+def naive_loss(planner, source, config, generator):
+    """Draw as a step does, and add up the error window by window in float64."""
+    n, length = config.batch_size, planner.window_length
+    starts = th.randint(len(source), (n,), generator=generator)
+    delays = draw_delays(n, planner.max_delay, config.mask, config.mask_end_probability, generator)
+    noise = th.randn(n, length, STATE_DIM + ACTION_DIM, generator=generator)
+    times = draw_times(n, config.schedule, config.time_sampling, generator)
+    error, total = 0.0, 0.0
+    for start, d, eps, t in zip(starts.tolist(), delays.tolist(), noise.double(), times.double(), strict=True):
+        steps = range(min(length, int(source.remaining[start])))
+        row, env = int(source.rows[start]), source.envs[start]
+        pairs = [(source.states[row + k, env], source.actions[row + k, env]) for k in steps]
+        states, actions = (th.stack(part).double() for part in zip(*pairs, strict=True))
+        clean = planner.normalizer.normalize(states, actions)
+        known = th.zeros_like(clean, dtype=th.bool)
+        known[0, :STATE_DIM], known[:d, STATE_DIM:] = True, True
+        alpha, sigma = alpha_sigma(t, config.schedule)
+        x, v = alpha * clean + sigma * eps[steps], alpha * eps[steps] - sigma * clean
+        output = naive_network(planner.network, th.where(known, clean, x), known, t)
+        share = (~known).double()
+        if d in steps:
+            share[d] *= config.decision_weight
+        error = error + ((output - v) ** 2 * share).sum() * math.exp(config.weight_factor * (source.values[start] - 1))
+        total += share.sum()
+    return error / total
+
+
+def naive_step(planner, source, config, generator, step, moments, gradient_steps):
+    """Clip, AdamW as published, parameter by parameter; return the loss and the clipped gradient."""
+    planner.zero_grad()
+    loss = naive_loss(planner, source, config, generator)
+    loss.backward()
+    gradient = th.cat([p.grad.flatten() for p in planner.parameters()])
+    clip = min(1.0, config.gradient_clip / float(gradient.norm()))
+    rate, (beta1, beta2) = learning_rate(step, gradient_steps, config), config.betas
+    with th.no_grad():
+        for p, (m, v) in zip(planner.parameters(), moments, strict=True):
+            m.mul_(beta1).add_((1 - beta1) * clip * p.grad)
+            v.mul_(beta2).add_((1 - beta2) * (clip * p.grad) ** 2)
+            p.mul_(1 - rate * config.weight_decay)
+            p.sub_(rate * (m / (1 - beta1 ** (step + 1))) / ((v / (1 - beta2 ** (step + 1))).sqrt() + 1e-8))
+    return loss.item(), clip * gradient
+
+
+@pytest.mark.parametrize(("precision", "tolerance"), [("float32", 1e-4), ("bfloat16", 3e-2)])
+def test_steps_are_those_of_a_naive_float64_trainer(precision, tolerance):
+    """Relative error of losses and gradients below the tolerance; the weights move the same way."""
+    source = make_source(10, 7)  # windows of 6 steps: some episodes end before
+    trainer = make_trainer(
+        source=source, held_out=0.0, batch_size=6, precision=precision, relative_states=False, depth=2, d_model=64
+    )
+    generator = th.Generator().manual_seed(1)
+    with th.no_grad():  # adaLN-zero would hide the blocks
+        for parameter in trainer.online.parameters():
+            parameter.add_(0.05 * th.randn(parameter.shape, generator=generator))
+    naive = copy.deepcopy(trainer.online).double()
+    begin = th.nn.utils.parameters_to_vector(naive.parameters()).detach()
+    moments = [(th.zeros_like(p), th.zeros_like(p)) for p in naive.parameters()]
+    generator.set_state(trainer.generator.get_state())
+    for step in range(3):
+        trainer.step()
+        expected, gradient = naive_step(naive, source, trainer.config, generator, step, moments, trainer.gradient_steps)
+        assert trainer.pop_losses()["planner/loss"] == pytest.approx(expected, rel=tolerance)
+        got = th.nn.utils.parameters_to_vector(p.grad for p in trainer.online.parameters()).double()
+        assert (got - gradient).norm() < tolerance * gradient.norm()
+    moved = th.nn.utils.parameters_to_vector(trainer.online.parameters()).double() - begin
+    naive_moved = th.nn.utils.parameters_to_vector(naive.parameters()).detach() - begin
+    # Adam divides by the gradient's size, so that entries near 0 move as far as all others, if need be the other way
+    assert (moved - naive_moved).norm() < 10 * tolerance * naive_moved.norm()
+
+
+@pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
+def test_recorded_updates_are_those_made_one_kernel_at_a_time():
+    trainers = [make_trainer(precision="float32", device="cuda") for _ in range(2)]
+    trainers[1]._captured = None  # launches every kernel
+    for trainer in trainers:
+        trainer.train(8)
+    for (path, recorded), (_, eager) in zip(*(leaves(t.state_dict()) for t in trainers), strict=True):
+        if isinstance(recorded, th.Tensor) and recorded.is_floating_point():
+            th.testing.assert_close(recorded, eager, rtol=1e-3, atol=1e-5, msg=path)
+    assert th.equal(trainers[0].generator.get_state(), trainers[1].generator.get_state())
+    saved = trainers[0].state_dict()
+    trainers[0].train(2)
+    trainers[0].load_state_dict(saved)  # recorded anew, over the loaded optimizer state
+    for trainer in trainers:
+        trainer.train()
+    assert trainers[0].pop_losses()["planner/loss"] == pytest.approx(trainers[1].pop_losses()["planner/loss"], rel=1e-2)
 
 
 @pytest.mark.parametrize("precision", ["float32", "auto"])

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from gymnasium import spaces
+from small_task import Drift, delayed
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -17,33 +17,9 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC, PlannerConfig
+from sb3_said import SAID, DelayedSAC, PlannerConfig
 
 PLANNER = {"d_model": 32, "depth": 1, "horizon": 3, "batch_size": 16, "sampling_steps": 2, "n_candidates": 4}
-
-
-class Drift(gym.Env):
-    """The state moves with the action; the reward is 1 - the first entry's square."""
-
-    observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
-    action_space = spaces.Box(-2.0, 2.0, (1,), np.float32)
-
-    def __init__(self, length=12):
-        self.length = length
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.t, self.state = 0, self.np_random.normal(size=2).astype(np.float32)
-        return self.state.copy(), {}
-
-    def step(self, action):
-        self.t += 1
-        self.state = (0.9 * self.state + 0.1 * np.array([action[0], self.state[0]])).astype(np.float32)
-        return self.state.copy(), 1.0 - float(self.state[0]) ** 2, False, self.t >= self.length, {}
-
-
-def delayed(delay=2, length=12, max_delay=None):
-    return DelayedObservationWrapper(Drift(length), delay, max_delay=max_delay)
 
 
 def make(env=None, cls=SAID, policy="MlpPolicy", planner_kwargs=(), **kwargs):
@@ -276,6 +252,34 @@ def test_a_planner_for_one_age_refuses_others(monkeypatch):
         model.predict(fresher)
     with model.policy.answering("expert"):
         assert answer(model, fresher).shape == (7, 1)
+
+
+def test_nothing_is_left_to_prepare_after_a_warmup(saved, monkeypatch):
+    from sb3_said.planner.sampling import DiT1d  # as the planner's cache calls it
+
+    model, other, obs = SAID.load(saved, device="cpu"), SAID.load(saved, device="cpu"), observe()
+    made, original = [], DiT1d.modulations
+    monkeypatch.setattr(DiT1d, "modulations", lambda self, t: made.append(self) or original(self, t))
+    set_random_seed(0)
+    model.warmup(7)
+    assert len(made) == 1
+    answers = [answer(model, obs), answer(model, obs, deterministic=False)]
+    assert len(made) == 1
+    set_random_seed(0)
+    assert np.array_equal(answers, [answer(other, obs), answer(other, obs, deterministic=False)])
+    model.set_planner(sampling_steps=3)
+    model.warmup()
+    assert len(made) == 3
+    with pytest.raises(ValueError, match="batch_size is 0, expected at least 1"):
+        model.warmup(0)
+
+
+@pytest.mark.parametrize("planner_kwargs", [{}, {"mask": "fixed"}])
+def test_every_agent_can_be_warmed_up(planner_kwargs):
+    for model in (make(planner_kwargs=planner_kwargs), make("Pendulum-v1", planner_kwargs=planner_kwargs)):
+        model.warmup()  # the expert answers
+        model.policy.planner_updates.fill_(1)
+        model.warmup(2)
 
 
 # ---------------------------------------------------------------------------------------------------- settings

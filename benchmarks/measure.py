@@ -1,0 +1,144 @@
+"""What the benchmarks share: timing turn by turn, the machine's matrix-product rate, tables and JSON."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import time
+from collections.abc import Callable, Mapping, Sequence
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+
+from sb3_said.evaluation import Interval, bootstrap_interval
+
+DTYPES = {"float32": th.float32, "bfloat16": th.bfloat16}
+
+
+def parser(doc: str | None) -> argparse.ArgumentParser:
+    """Return a parser with the options of every benchmark."""
+    made = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    made.add_argument("--num-threads", type=int, help="torch threads; all cores by default")
+    made.add_argument("--rounds", type=int, help="turns of each variant; more make narrower intervals")
+    made.add_argument("--device", default="cpu", help="torch device, such as cuda")
+    made.add_argument("--json", type=Path, metavar="FILE", help="also write settings, machine and figures to FILE")
+    return made
+
+
+def turn_by_turn(
+    variants: Mapping[str, Callable[[], Any]], rounds: int, device: str | th.device = "cpu"
+) -> dict[str, np.ndarray]:
+    """Time variants in turn, in both orders alternately, so that a drift of the machine meets all of them alike.
+
+    Every variant runs once before, uncounted.
+
+    :param variants: what to time, by name
+    :param rounds: turns of each
+    :param device: waited for before the clock is read
+    :return: seconds of each turn by name, (rounds,) each
+    """
+
+    def wait() -> None:
+        if th.device(device).type == "cuda":
+            th.cuda.synchronize(device)
+
+    names = list(variants)
+    seconds = {name: np.empty(rounds) for name in names}
+    for name in names:
+        variants[name]()
+    for turn in range(rounds):
+        for name in names if turn % 2 == 0 else names[::-1]:
+            wait()
+            began = time.perf_counter()
+            variants[name]()
+            wait()
+            seconds[name][turn] = time.perf_counter() - began
+    return seconds
+
+
+def ratio(slow: np.ndarray, fast: np.ndarray) -> Interval:
+    """Return how many times as long ``slow`` takes: the median of the ratios turn by turn, with its interval.
+
+    :param slow: (rounds,) seconds
+    :param fast: (rounds,) seconds of the same turns
+    """
+    return bootstrap_interval(slow / fast, np.median)
+
+
+def matmul_rate(dtype: str, device: str | th.device = "cpu", seconds: float = 1.0) -> float:
+    """Return what this machine reaches in large square matrix products, the 95th percentile in FLOP/s.
+
+    :param dtype: ``"float32"`` or ``"bfloat16"``
+    :param device: to measure
+    :param seconds: to measure for
+    """
+    n = 2048 if th.device(device).type == "cpu" else 8192
+    a, b = (th.randn(n, n, device=device).to(DTYPES[dtype]) for _ in range(2))
+    out = th.empty_like(a)
+    rounds = 3
+    while True:
+        times = turn_by_turn({"matmul": lambda: th.mm(a, b, out=out)}, rounds, device)["matmul"]
+        if times.sum() >= seconds:
+            return float(2 * n**3 / np.percentile(times, 5))
+        rounds *= 2
+
+
+def percentiles(seconds: np.ndarray) -> dict[str, float]:
+    """Return p50, p95 and p99 in milliseconds."""
+    return {f"p{q}_ms": float(1e3 * np.percentile(seconds, q)) for q in (50, 95, 99)}
+
+
+def print_table(rows: Sequence[Mapping[str, Any]]) -> None:
+    """Print rows of the same keys as a Markdown table."""
+    header = list(rows[0])
+    print(f"| {' | '.join(header)} |")
+    print(f"|{'|'.join('---' if isinstance(rows[0][key], str) else '---:' for key in header)}|")
+    for row in rows:
+        print(f"| {' | '.join(_cell(row[key]) for key in header)} |")
+
+
+def write_json(path: Path | None, args: argparse.Namespace, rows: Sequence[Mapping[str, Any]], **more: Any) -> None:
+    """Write what was measured, with which settings, when and on what machine; nothing without a path."""
+    if path is None:
+        return
+    settings = {key: value for key, value in vars(args).items() if key != "json"}
+    result = {"date": date.today().isoformat(), "settings": settings, "machine": machine(args.device)}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({**result, "rows": list(rows), **more}, indent=1, default=_plain) + "\n")
+
+
+def machine(device: str | th.device = "cpu") -> dict[str, Any]:
+    """Return what the figures depend on: processor, threads, versions."""
+    capabilities = th.cpu.get_capabilities() if hasattr(th.cpu, "get_capabilities") else {}
+    on_gpu = th.device(device).type == "cuda"
+    return {
+        "device": th.cuda.get_device_name(device) if on_gpu else _processor(),
+        "bfloat16": [name for name in ("avx512_bf16", "amx_bf16") if capabilities.get(name)],
+        "threads": th.get_num_threads(),
+        "python": platform.python_version(),
+        "torch": th.__version__,
+    }
+
+
+def _processor() -> str:
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.is_file() else []
+    return next(
+        (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.processor()
+    )
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, Interval):
+        return f"{value.value:.2f} [{value.low:.2f}, {value.high:.2f}]"
+    return f"{value:,.2f}" if isinstance(value, float) else str(value)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Interval):
+        return {"value": value.value, "low": value.low, "high": value.high, "confidence": value.confidence}
+    return str(value)

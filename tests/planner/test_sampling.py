@@ -1,0 +1,323 @@
+"""Sampling's fast path: against a naive one, in bfloat16, and what it keeps between calls."""
+
+import copy
+import dataclasses
+import itertools
+import math
+import pickle
+
+import pytest
+import torch as th
+import torch.nn.functional as F
+
+from sb3_said.planner import InpaintingPlanner, PlannerConfig, sampling
+from sb3_said.planner import planner as planner_module
+from sb3_said.planner.diffusion import END_TIMES, START_TIME
+
+OBS, ACT, DELAY, N = 4, 2, 3, 8
+CONFIG = PlannerConfig(depth=2, d_model=64, horizon=4, sampling_steps=4, n_candidates=N, precision="float32")
+LENGTH = DELAY + CONFIG.horizon
+
+
+def make_planner(**changes):
+    """A planner as it is made, but for random numbers in the layers that begin as zeros."""
+    with th.random.fork_rng():
+        th.manual_seed(0)
+        planner = InpaintingPlanner(OBS, ACT, DELAY, dataclasses.replace(CONFIG, **changes))
+        for layer in (planner.network.modulation, planner.network.out):
+            th.nn.init.normal_(layer.weight, std=0.1)
+        planner.fit_normalizer(3 + 2 * th.randn(50, OBS), th.rand(50, ACT) * 2 - 1)
+    return planner.requires_grad_(False)
+
+
+def make_inputs(n=3, seed=0):
+    g = th.Generator().manual_seed(seed)
+    history = th.rand(n, DELAY, ACT, generator=g) * 2 - 1
+    noise = th.randn(N, LENGTH, OBS + ACT, generator=g)
+    return 3 + 2 * th.randn(n, OBS, generator=g), history, th.arange(n) % (DELAY + 1), noise
+
+
+def value(states, actions):
+    return states.sin().sum(-1) + actions.prod(-1)
+
+
+def answer(planner, inputs=None, **kwargs):
+    observation, history, delay, noise = make_inputs() if inputs is None else inputs
+    return planner.plan(observation, history, delay, **({"value_fn": value, "noise": noise} | kwargs))
+
+
+def same(first, second):
+    return all(th.equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+# --- against a naive planner -----------------------------------------------------------------------------------------
+
+
+def naive_network(net, x, context, t):
+    """The transformer for one window (L, in_dim) at one time, head by head, with the modulations of this call."""
+    embedded = net.modulation(
+        F.silu(net.time_embedding(th.cat([(t * net.frequencies).cos(), (t * net.frequencies).sin()])))
+    )
+    parts = iter(embedded.view(-1, net.d_model))
+
+    def norm(h, shift, scale):
+        centred = h - h.mean(-1, keepdim=True)
+        return centred / (centred.square().mean(-1, keepdim=True) + 1e-6).sqrt() * (1 + scale) + shift
+
+    tokens = net.token_embedding(x) + context
+    for block in net.blocks:
+        shift, scale, gate, shift_m, scale_m, gate_m = (next(parts) for _ in range(6))
+        q, k, v = block.qkv(norm(tokens, shift, scale)).chunk(3, dim=-1)
+        heads = []
+        for head in range(net.d_model // 32):
+            part = slice(32 * head, 32 * head + 32)
+            heads.append((q[:, part] @ k[:, part].T / math.sqrt(32)).softmax(-1) @ v[:, part])
+        tokens = tokens + gate * block.attention_out(th.cat(heads, -1))
+        h = block.mlp[0](norm(tokens, shift_m, scale_m))
+        tokens = tokens + gate_m * block.mlp[2](h * 0.5 * (1 + th.erf(h / math.sqrt(2))))
+    return net.out(norm(tokens, next(parts), next(parts)))
+
+
+@th.no_grad()
+def naive_plan(planner, observation, history, d, noise):
+    """DDIM, window after window: (N, L, OBS) and (N, L, ACT), in the planner's units."""
+    times = th.linspace(END_TIMES["cosine"], START_TIME, planner.config.sampling_steps + 1, dtype=th.float64)
+    known = th.zeros(LENGTH, OBS + ACT, dtype=th.bool)
+    known[0, :OBS], known[:d, OBS:] = True, True
+    given = th.zeros(LENGTH, OBS + ACT)
+    given[0, :OBS] = observation
+    given[:d, OBS:] = history[DELAY - d :]
+    clean = planner.normalizer.normalize(given[:, :OBS], given[:, OBS:])
+    context = planner.network.context(clean[None], known[None])[0]
+    windows = []
+    for x in planner.config.temperature * noise:
+        x = th.where(known, clean, x)
+        for now, after in itertools.pairwise(times):
+            v = naive_network(planner.network, x, context, now.float())
+            (alpha, sigma), (alpha_next, sigma_next) = (
+                (math.cos(math.pi / 2 * float(s)), math.sin(math.pi / 2 * float(s))) for s in (now, after)
+            )
+            x = alpha_next * (alpha * x - sigma * v) + sigma_next * (sigma * x + alpha * v)
+            x = th.where(known, clean, x)
+        windows.append(x)
+    return th.stack(windows)
+
+
+def test_fast_path_gives_what_a_naive_one_gives():
+    # Tolerance: 1e-4 standard deviations, of sums in another order; the same candidates are chosen.
+    planner = make_planner()
+    observation, history, delay, noise = make_inputs(4)
+    plan = answer(planner, (observation, history, delay, noise))
+    chosen = []
+    for b, d in enumerate(delay.tolist()):
+        x = naive_plan(planner, observation[b], history[b], d, noise)
+        states, actions = planner.normalizer.denormalize(x)
+        assert ((plan.states[b] - states) / planner.normalizer.state_std).abs().max() < 1e-4
+        th.testing.assert_close(plan.actions[b], actions, atol=1e-4, rtol=1e-4)
+        values = value(states, actions)[:, d + 1 :].mean(1)
+        th.testing.assert_close(plan.values[b], values, atol=1e-3, rtol=1e-3)
+        chosen.append(int(values.argmax()))
+        th.testing.assert_close(plan.action[b], actions[chosen[-1], d], atol=1e-4, rtol=1e-4)
+    assert len(set(chosen)) > 1
+
+
+@pytest.mark.parametrize("prediction", ["v", "epsilon"])
+def test_bfloat16_stays_close_and_chooses_as_well(prediction):
+    # Tolerances: plans differ by 0.01 of their own spread on average; the chosen candidate's value, computed in
+    # float32, falls short of the best one's by at most a tenth of the candidates' spread on average.
+    inputs = make_inputs(40)
+    exact, half = (answer(make_planner(precision=p, prediction=prediction), inputs) for p in ("float32", "bfloat16"))
+    for a, b in ((exact.states, half.states), (exact.actions, half.actions)):
+        assert b.dtype == th.float32 and not th.equal(a, b)
+        assert (a - b).abs().mean() < 0.01 * a.std()
+    of_chosen = exact.values.gather(1, half.values.argmax(1, keepdim=True))[:, 0]
+    shortfall = (exact.values.amax(1) - of_chosen) / (exact.values.amax(1) - exact.values.amin(1))
+    assert shortfall.mean() < 0.1
+
+
+# --- what is kept ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def prepared_times(monkeypatch):
+    """Count how often modulations are computed."""
+    counts, original = [], sampling.DiT1d.modulations
+    monkeypatch.setattr(sampling.DiT1d, "modulations", lambda self, t: counts.append(len(t)) or original(self, t))
+    return counts
+
+
+def test_modulations_are_computed_once_for_all_calls_candidates_and_environments(prepared_times):
+    planner = make_planner()
+    first = answer(planner)
+    assert same(answer(planner), first)
+    answer(planner, make_inputs(2, seed=1), noise=None, n_candidates=3)
+    planner.plan(*make_inputs(1)[:3], temperature=0.0)
+    assert prepared_times == [4]
+    answer(planner, sampling_steps=2)
+    planner.config = dataclasses.replace(planner.config, sampling_steps=3, n_candidates=2)
+    answer(planner)
+    assert prepared_times == [4, 2, 3]
+
+
+def nudge(planner):
+    with th.no_grad():
+        planner.network.blocks[0].qkv.bias += 0.5
+
+
+def load(planner):
+    planner.load_state_dict({name: 0.9 * value for name, value in planner.state_dict().items()})
+
+
+def assign(planner):
+    planner.load_state_dict({name: 0.9 * value for name, value in planner.state_dict().items()}, assign=True)
+
+
+def average(planner):
+    parameters = list(planner.parameters())
+    with th.no_grad():
+        th._foreach_lerp_(parameters, [th.zeros_like(p) for p in parameters], 0.1)
+
+
+def optimize(planner):  # fused: writes without counting a version
+    planner.requires_grad_(True)
+    answer(planner)
+    for parameter in planner.parameters():
+        parameter.grad = th.ones_like(parameter)
+    optimizer = th.optim.AdamW(planner.parameters(), lr=0.01, fused=True)
+    optimizer.step()
+    optimizer.zero_grad()
+    planner.requires_grad_(False)
+
+
+def in_inference_mode(planner):
+    with th.inference_mode():
+        planner.network.out.weight.mul_(2.0)
+
+
+def replace_a_layer(planner):
+    th.manual_seed(1)
+    planner.network.blocks[1].attention_out = th.nn.Linear(64, 64)
+
+
+def move(planner):
+    planner.network.double().float().blocks[0].qkv.bias.data.add_(0.5)
+
+
+@pytest.mark.parametrize("change", [nudge, load, assign, average, optimize, in_inference_mode, replace_a_layer, move])
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_a_change_of_weights_is_noticed(change, precision):
+    planner = make_planner(precision=precision)
+    before = answer(planner)
+    change(planner)
+    after = answer(planner)
+    assert not th.equal(after.states, before.states)
+    fresh = copy.deepcopy(planner)
+    assert fresh._cache._prepared is None
+    assert same(answer(fresh), after)
+
+
+def test_weights_made_in_inference_mode_are_never_taken_as_unchanged():
+    with th.inference_mode():
+        planner = make_planner()
+    before = answer(planner)
+    with th.inference_mode():
+        planner.network.out.weight.mul_(2.0)
+    assert not th.equal(answer(planner).states, before.states)
+
+
+def test_copies_and_pickles_are_independent():
+    planner = make_planner(precision="bfloat16")
+    before = answer(planner)
+    twin, read = copy.deepcopy(planner), pickle.loads(pickle.dumps(planner))
+    nudge(planner)
+    assert same(answer(twin), before) and same(answer(read), before)
+    assert not th.equal(answer(planner).states, before.states)
+    assert not any("_cache" in name for name in planner.state_dict())
+
+
+# --- CUDA graphs -----------------------------------------------------------------------------------------------------
+
+
+class FakeGraph:
+    """Holds its inputs in place and runs the recorded function on them."""
+
+    made = 0
+
+    def __init__(self, function, inputs):
+        FakeGraph.made += 1
+        self.function, self.inputs = function, [x.clone() for x in inputs]
+
+    def __call__(self, *inputs):
+        for static, x in zip(self.inputs, inputs, strict=True):
+            static.copy_(x)
+        return self.function(*self.inputs)
+
+
+class Value(th.nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.weight = th.nn.Parameter(th.ones(OBS))
+
+    def forward(self, states, actions):
+        return states.sin() @ self.weight + actions.prod(-1)
+
+    score = forward
+
+
+def test_a_decision_is_recorded_once_for_its_sizes_settings_and_weights(monkeypatch):
+    monkeypatch.setattr(sampling, "Graph", FakeGraph)
+    monkeypatch.setattr(FakeGraph, "made", 0)
+    planner, eager, module = make_planner(), make_planner(), Value()
+    monkeypatch.setattr(planner, "_can_be_graphed", lambda value_fn: True)
+
+    def check(made, **kwargs):
+        with th.no_grad():
+            plans = [answer(p, **({"value_fn": module.score} | kwargs)) for p in (planner, eager)]
+        th.testing.assert_close(plans[0], plans[1])
+        assert FakeGraph.made == made
+
+    check(1)
+    for seed in (1, 2):
+        check(1, inputs=make_inputs(seed=seed))  # other ages too
+    check(1, temperature=0.2)
+    check(2, inputs=make_inputs(2))
+    check(3, noise=make_inputs()[3][:5])
+    check(4, value_fn=None)
+    check(4)
+    for p in (planner, eager):
+        p.config = dataclasses.replace(p.config, scored_states="all")
+    check(5)
+    module.weight.data.mul_(-1.0)  # read where it is, at every replay
+    check(5)
+    module.weight.data = th.full((OBS,), 0.5)
+    check(6)
+    for p in (planner, eager):
+        nudge(p)
+    check(7)
+    for n in range(1, sampling.MAX_GRAPHS + 2):
+        check(7 + n, inputs=make_inputs(n), noise=make_inputs()[3][:2])
+    assert len(planner._cache._graphs) == sampling.MAX_GRAPHS
+
+
+def test_only_modules_on_a_gpu_are_recorded(monkeypatch):
+    planner = make_planner()
+    assert not planner._can_be_graphed(None)
+    monkeypatch.setattr(InpaintingPlanner, "device", property(lambda self: th.device("cuda")))
+    module = Value()
+    assert all(planner._can_be_graphed(f) for f in (None, module, module.score))
+    assert not planner._can_be_graphed(value) and not planner._can_be_graphed(lambda states, actions: states[..., 0])
+    planner.requires_grad_(True)
+    assert not planner._can_be_graphed(module)
+
+
+@pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_a_recorded_decision_is_the_eager_one(precision, monkeypatch):
+    planner, module = make_planner(precision=precision).cuda(), Value().cuda()
+    for inputs in (make_inputs(), make_inputs(seed=1), make_inputs(2)):
+        inputs = [x.cuda() for x in inputs]
+        recorded = answer(planner, inputs, value_fn=module.score)
+        with monkeypatch.context() as patch:
+            patch.setattr(planner_module.InpaintingPlanner, "_can_be_graphed", lambda self, value_fn: False)
+            th.testing.assert_close(answer(planner, inputs, value_fn=module.score), recorded, atol=1e-4, rtol=1e-4)
+    assert planner._cache._graphs
