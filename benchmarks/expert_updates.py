@@ -59,14 +59,20 @@ def _dtype_name(model: DelayedSAC) -> str:
     return str(compute_dtype(model.precision, model.device)).removeprefix("torch.")
 
 
-def main(argv: list[str] | None = None) -> None:
+def parse(argv: list[str] | None) -> argparse.Namespace:
+    """Read the command line."""
     p = parser(__doc__)
     p.add_argument("--env", default="Hopper-v5", help="gymnasium task, for its sizes")
     p.add_argument("--delay", type=int, default=4, help="of the delayed rows")
     p.add_argument("--batch-size", type=int, default=256)
     p.add_argument("--steps", type=int, default=2000, help="random steps in the replay buffers")
     p.set_defaults(num_threads=1, rounds=40)
-    args = p.parse_args(argv)
+    return p.parse_args(argv)
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Run the command line."""
+    args = parse(argv)
     th.set_num_threads(args.num_threads or th.get_num_threads())
 
     models = {
@@ -86,7 +92,7 @@ def main(argv: list[str] | None = None) -> None:
         each = seconds[name] / UPDATES_PER_TURN
         row: dict[str, Any] = {"updates": name, **percentiles(each), "per second": float(1 / each.mean())}
         row["times SB3's SAC"] = ratio(seconds["SB3's SAC"], seconds[name])
-        floor = float("nan")
+        floor = None
         if isinstance(model, DelayedSAC):
             floor = matmul_flops(model, args.batch_size) / rates[_dtype_name(model)] / float(each.mean())
         row["fraction of floor"] = floor

@@ -135,7 +135,7 @@ def _processor() -> str:
 def _cell(value: Any) -> str:
     if isinstance(value, Interval):
         return f"{value.value:.2f} [{value.low:.2f}, {value.high:.2f}]"
-    return f"{value:,.2f}" if isinstance(value, float) else str(value)
+    return f"{value:,.2f}" if isinstance(value, float) else "" if value is None else str(value)
 
 
 def _plain(value: Any) -> Any:
