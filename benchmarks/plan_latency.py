@@ -51,7 +51,11 @@ class Setting(NamedTuple):
     delay: int = 8
 
 
-SETTINGS = (Setting("paper", 8, 20, 50, rounds=20), Setting("real time", 2, 5, 16, rounds=300))
+SETTINGS = (
+    Setting("paper", 8, 20, 50, rounds=20),
+    Setting("real time", 2, 5, 16, rounds=300),
+    Setting("real time, the width of --preset cpu", 2, 5, 16, rounds=300, d_model=128),
+)
 QUICK = Setting("quick", 1, 2, 4, rounds=3, d_model=32, horizon=2, delay=2)
 
 
@@ -122,9 +126,9 @@ def measure_setting(setting: Setting, rounds: int, device: str) -> dict[str, Any
     )
     ours = percentiles(np.append(seconds["ours"], first))
     flops = matmul_flops(setting, spaces[0].shape[0], spaces[1].shape[0])
-    size = f"depth {setting.depth}, {setting.sampling_steps} steps, {setting.n_candidates} candidates"
+    work = f"{setting.sampling_steps} steps, {setting.n_candidates} candidates"
     return {
-        "setting": f"{setting.name}: {size}",
+        "setting": f"{setting.name}: depth {setting.depth}, width {setting.d_model}, {work}",
         "ours p50 ms": ours["p50_ms"],
         "p95": ours["p95_ms"],
         "p99": ours["p99_ms"],
@@ -188,9 +192,12 @@ def measure_scaling(base: Setting, rounds: int, device: str) -> list[dict[str, A
 
 def main(argv: list[str] | None = None) -> None:
     p = parser(__doc__)
-    p.add_argument("--depth", type=int, help="blocks of the transformer; together with the next two: only this setting")
+    p.add_argument(
+        "--depth", type=int, help="blocks of the transformer; together with the next three: only this setting"
+    )
     p.add_argument("--sampling-steps", type=int, default=5, help="with --depth")
     p.add_argument("--n-candidates", type=int, default=16, help="with --depth")
+    p.add_argument("--d-model", type=int, default=256, help="with --depth")
     p.add_argument("--no-scaling", action="store_true", help="leave the second table out")
     p.add_argument("--quick", action="store_true", help="a tiny network and few turns: shows that it runs")
     args = p.parse_args(argv)
@@ -201,7 +208,9 @@ def main(argv: list[str] | None = None) -> None:
     if args.quick:
         settings = (QUICK,)
     elif args.depth:
-        settings = (Setting("own", args.depth, args.sampling_steps, args.n_candidates, rounds=50),)
+        settings = (
+            Setting("own", args.depth, args.sampling_steps, args.n_candidates, rounds=50, d_model=args.d_model),
+        )
     rows = [measure_setting(setting, args.rounds or setting.rounds, args.device) for setting in settings]
     print_table(rows)
     scaling = []

@@ -87,7 +87,7 @@ class DiT1d(nn.Module):
     :param obs_dim: numbers in a state
     :param act_dim: numbers in an action
     :param max_delay: D, the most actions that can be known
-    :param length: L, steps of a window
+    :param length: steps of the longest window
     :param d_model: width, a multiple of 32
     :param depth: number of blocks
     :param positions: ``"sinusoidal"`` (fixed) or ``"learned"``
@@ -158,17 +158,20 @@ class DiT1d(nn.Module):
     def context(self, window: th.Tensor, known: th.Tensor) -> th.Tensor:
         """Return what is added to the tokens because of their place and of what is known: (B, L, d_model).
 
-        :param window: (B, L, obs_dim + act_dim), normalised; only known entries are read
+        :param window: (B, L, obs_dim + act_dim), normalised, L at most ``length``; only known entries are read
         :param known: (B, L, obs_dim + act_dim) bool known mask
         """
         flags = th.stack((known[..., 0], known[..., self.obs_dim]), dim=-1)  # (B, L, 2): state known, action known
         flags = flags.to(window.dtype)
-        added = self.flag_embedding(flags) + self.positions
+        added = self.flag_embedding(flags) + self.positions[: window.shape[1]]
         if self.known_embedding is None:
             return added
         given = th.where(known, window, 0.0)
-        state, actions = given[:, 0, : self.obs_dim], given[:, : self.max_delay, self.obs_dim :]
-        part = th.cat([state, actions.flatten(1), flags[:, : self.max_delay, 1]], dim=1)
+        state = given[:, 0, : self.obs_dim]
+        # (B, D, act_dim + 1): actions, and whether they are known; none are behind the end of a shorter window
+        actions = th.cat([given[..., self.obs_dim :], flags[..., 1:]], dim=-1)[:, : self.max_delay]
+        actions = F.pad(actions, (0, 0, 0, self.max_delay - actions.shape[1]))
+        part = th.cat([state, actions[..., :-1].flatten(1), actions[..., -1]], dim=1)
         return added + self.known_embedding(part)[:, None]
 
     def forward(

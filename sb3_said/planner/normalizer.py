@@ -88,7 +88,7 @@ class Normalizer(nn.Module):
         z = self.normalize_states(states)
         if self.relative_states:
             first = z[..., :1, :]
-            z = th.cat([first, (z[..., 1:, :] - first) / self.move_std], dim=-2)
+            z = th.cat([first, (z[..., 1:, :] - first) / self.move_std[: z.shape[-2] - 1]], dim=-2)
         return th.cat([z, self.normalize_actions(actions)], dim=-1)
 
     def denormalize(self, x: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
@@ -96,7 +96,7 @@ class Normalizer(nn.Module):
         z, actions = x.split([self.obs_dim, self.act_dim], dim=-1)
         if self.relative_states:
             first = z[..., :1, :]
-            z = th.cat([first, first + z[..., 1:, :] * self.move_std], dim=-2)
+            z = th.cat([first, first + z[..., 1:, :] * self.move_std[: z.shape[-2] - 1]], dim=-2)
         return self.denormalize_states(z), self.denormalize_actions(actions)
 
     def normalize_states(self, states: th.Tensor) -> th.Tensor:

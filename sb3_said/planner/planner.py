@@ -25,7 +25,7 @@ class Plan(NamedTuple):
     """Candidate plans for B decisions, in environment units."""
 
     action: th.Tensor  # (B, act_dim), in [-1, 1]: the best candidate's action at the decision index
-    states: th.Tensor  # (B, N, L, obs_dim)
+    states: th.Tensor  # (B, N, L, obs_dim), L the largest delay of the decisions plus the horizon
     actions: th.Tensor  # (B, N, L, act_dim), in [-1, 1]
     values: th.Tensor  # (B, N), the scores the best was chosen by
 
@@ -104,7 +104,8 @@ class InpaintingPlanner(nn.Module):
     ) -> th.Tensor:
         """Return the weighted mean squared error over unknown entries of valid steps (the paper's Algorithm 1).
 
-        The decision index counts ``config.decision_weight`` times as much as the others.
+        The decision index counts ``config.decision_weight`` times as much as the others. Of a window of delay d only
+        the first d + ``config.horizon`` steps exist.
 
         :param windows: B windows of ``window_length`` steps, environment units
         :param delay: (B,) mask lengths; drawn as ``config.mask`` says by default
@@ -124,9 +125,10 @@ class InpaintingPlanner(nn.Module):
             delay = inpainting.draw_delays(n, self.max_delay, config.mask, config.mask_end_probability, generator)
         # Delays on a GPU are not read back: every update would wait for it, and a recorded one could not
         delay = self._delay(delay, n) if delay.device.type == "cpu" else delay
-        valid = windows.valid.to(device)  # (B, L)
+        valid = windows.valid.to(device) & self._within(delay, self.window_length)  # (B, L)
         clean = self.normalizer.normalize(states, actions)  # (B, L, obs_dim + act_dim)
-        # Steps behind an episode's end repeat its last row: they are neither shown as known nor learned
+        # Steps behind an episode's end repeat its last row: they are neither shown as known nor learned, and no more
+        # are those behind the horizon, so that a decision at a small delay can do without them
         known = inpainting.known_mask(delay, self.window_length, self.obs_dim, self.act_dim) & valid[..., None]
         noise = self._noise(clean.shape, generator)
         t = diffusion.draw_times(n, config.schedule, config.time_sampling, generator, device)
@@ -176,23 +178,25 @@ class InpaintingPlanner(nn.Module):
         :param n_candidates: N
         :param sampling_steps: denoising steps
         :param temperature: factor on the initial noise
-        :param noise: (N, L, obs_dim + act_dim) standard normal initial noise, shared by all decisions, to repeat a plan
+        :param noise: (N, ``window_length``, obs_dim + act_dim) standard normal initial noise, shared by all decisions,
+            to repeat a plan
         :param generator: of the initial noise where none is given; torch's global one by default
         :raises ValueError: for wrong shapes, numbers that are not finite, or delays outside 0..max_delay
         """
-        config, length = self.config, self.window_length
+        config = self.config
         observation, action_history = self._tensor(observation), self._tensor(action_history)
         _check("observation", observation, (None, self.obs_dim))
         n = len(observation)
         _check("action_history", action_history, (n, self.max_delay, self.act_dim))
         delay = self._delay(delay, n)
-        skipped = 1 + int(delay.min())  # states that no decision scores need no value
+        shortest, longest = int(delay.min()), int(delay.max())
+        length = longest + config.horizon  # a decision costs what its age costs
         temperature = config.temperature if temperature is None else temperature
         shape = (length, self.obs_dim + self.act_dim)
         if noise is not None:
             noise = self._tensor(noise)
-            _check("noise", noise, (n_candidates, *shape))
-            n_candidates = len(noise)
+            _check("noise", noise, (n_candidates, self.window_length, shape[1]))
+            n_candidates, noise = len(noise), noise[:, :length]
         elif n_candidates is None:
             n_candidates = 1 if value_fn is None else config.n_candidates
         if n_candidates < 1 or not temperature >= 0:
@@ -214,10 +218,10 @@ class InpaintingPlanner(nn.Module):
         inputs = (observation, action_history, delay, x)
         if self._can_be_graphed(value_fn):
             key = (config, tuple(x.shape), value_fn, addresses(self if value_fn is None else _owner(value_fn)))
-            graph = self._cache.graph(key, partial(self._inpaint, prepared, steps, value_fn, 1), inputs)
+            graph = self._cache.graph(key, partial(self._inpaint, prepared, steps, value_fn, 0, True), inputs)
             plan = Plan(*graph(*inputs))
         else:
-            plan = self._inpaint(prepared, steps, value_fn, skipped, *inputs)
+            plan = self._inpaint(prepared, steps, value_fn, shortest, longest > shortest, *inputs)
         if plan.values.isnan().any():
             raise ValueError("value_fn returned NaN, so that no candidate is the best; check the critic.")
         return plan
@@ -231,7 +235,8 @@ class InpaintingPlanner(nn.Module):
         prepared: Prepared,
         steps: Sequence[diffusion.SolverStep],
         value_fn: ValueFn | None,
-        skipped: int,
+        shortest: int,
+        is_mixed: bool,
         observation: th.Tensor,
         action_history: th.Tensor,
         delay: th.Tensor,
@@ -239,16 +244,19 @@ class InpaintingPlanner(nn.Module):
     ) -> Plan:
         """Go from what is known and initial noise to the decision, without waiting for the device on the way.
 
-        :param skipped: states at a window's beginning that are not scored at any of the delays
+        :param shortest: a lower bound of the delays: no state before it is scored
+        :param is_mixed: whether delays may differ, so that some windows end before others
         :param x: (B, N, L, obs_dim + act_dim) initial noise, scaled
         """
-        given = inpainting.known_window(observation, action_history, delay, self.window_length)
-        known = inpainting.known_mask(delay, self.window_length, self.obs_dim, self.act_dim)
+        length = x.shape[2]
+        given = inpainting.known_window(observation, action_history, delay, length)
+        known = inpainting.known_mask(delay, length, self.obs_dim, self.act_dim)
         clean = self.normalizer.normalize(*self._split(given))  # (B, L, obs_dim + act_dim), as given and known
+        valid = self._within(delay, length).repeat_interleave(x.shape[1], 0) if is_mixed else None  # (B * N, L)
         network, modulations = prepared
         context = network.context(clean, known)
         x = diffusion.solve(
-            lambda x, i: network(x.flatten(0, 1), context, modulations[i]).float().view_as(x),
+            lambda x, i: network(x.flatten(0, 1), context, modulations[i], valid).float().view_as(x),
             x,
             steps,
             self.config.prediction,
@@ -257,12 +265,12 @@ class InpaintingPlanner(nn.Module):
         # What is given comes back exactly as given, without the rounding of the normaliser
         x = th.where(known[:, None], given[:, None], th.cat(self.normalizer.denormalize(x), dim=-1))
         states, actions = self._split(x)
-        values = self._values(states, actions, delay, value_fn, skipped)  # (B, N)
+        values = self._values(states, actions, delay, value_fn, shortest)  # (B, N)
         rows = th.arange(len(x), device=x.device)
         return Plan(actions[rows, values.argmax(1), delay], states, actions, values)
 
     def _values(
-        self, states: th.Tensor, actions: th.Tensor, delay: th.Tensor, value_fn: ValueFn | None, skipped: int
+        self, states: th.Tensor, actions: th.Tensor, delay: th.Tensor, value_fn: ValueFn | None, shortest: int
     ) -> th.Tensor:
         """Return the mean value of each candidate's scored states: (B, N)."""
         if value_fn is None:
@@ -275,7 +283,7 @@ class InpaintingPlanner(nn.Module):
         elif self.config.scored_states == "all":
             skipped, first = 1, th.ones_like(delay)
         else:
-            first = 1 + delay  # (B,)
+            skipped, first = 1 + shortest, 1 + delay  # (B,)
         values = value_fn(states[:, :, skipped:], actions[:, :, skipped:]).float()  # (B, N, L - skipped)
         if values.shape != (*states.shape[:2], states.shape[2] - skipped):
             raise ValueError(
@@ -283,8 +291,13 @@ class InpaintingPlanner(nn.Module):
                 f"{(*states.shape[:2], states.shape[2] - skipped)}: drop a last dimension of 1."
             )
         steps = th.arange(skipped, states.shape[2], device=self.device)
-        scored = (steps >= first[:, None])[:, None]  # (B, 1, L - skipped)
+        last = first + 1 if self.config.scored_states == "decision" else delay + self.config.horizon  # (B,)
+        scored = ((steps >= first[:, None]) & (steps < last[:, None]))[:, None]  # (B, 1, L - skipped)
         return th.where(scored, values, 0.0).sum(-1) / scored.sum(-1)
+
+    def _within(self, delay: th.Tensor, length: int) -> th.Tensor:
+        """Tell which steps a window of each delay has, d + horizon of them: (B, L) bool."""
+        return th.arange(length, device=delay.device) < delay[:, None] + self.config.horizon
 
     def _split(self, x: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         states, actions = x.split([self.obs_dim, self.act_dim], dim=-1)

@@ -70,4 +70,4 @@ def test_quick_run_writes_what_it_prints(tmp_path, capsys):
     }
     assert all(np.isfinite(line["slope"]) for line in result["scaling"])
     printed = capsys.readouterr().out
-    assert "quick: depth 1, 2 steps, 4 candidates" in printed and "environments, batched" in printed
+    assert "quick: depth 1, width 32, 2 steps, 4 candidates" in printed and "environments, batched" in printed

@@ -3,10 +3,12 @@
 import dataclasses
 import json
 
+import numpy as np
 import pytest
 import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
+from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_said.common import precision
 from sb3_said.common.windows import Windows
@@ -43,6 +45,11 @@ def make_windows(n=6, seed=0):
     states = 5 * th.randn(n, LENGTH, OBS, generator=generator)
     actions = th.rand(n, LENGTH, ACT, generator=generator) * 2 - 1
     return Windows(states, actions, valid, th.rand(n, generator=generator))
+
+
+def existing(windows, delay):
+    """Steps that are in the episode and within the horizon of their delay: (n, L) bool."""
+    return windows.valid & (th.arange(LENGTH) < delay[:, None] + SMALL.horizon)
 
 
 def seeded(seed=0):
@@ -190,6 +197,8 @@ def test_loss_against_a_naive_computation(prediction, schedule, relative):
     noise = th.randn(n, LENGTH, OBS + ACT, generator=generator)
     t = draw_times(n, schedule, planner.config.time_sampling, generator)
     normalizer, total, count = planner.normalizer, 0.0, 0
+    exists = existing(windows, delay)
+    assert not th.equal(exists, windows.valid)
     for b in range(n):
         alpha, sigma = alpha_sigma(t[b], schedule)
         for k in range(LENGTH):
@@ -200,7 +209,7 @@ def test_loss_against_a_naive_computation(prediction, schedule, relative):
             action = (windows.actions[b, k] - normalizer.action_mean) / normalizer.action_std
             clean = th.cat([state, action])
             for j in range(OBS + ACT):
-                if not windows.valid[b, k]:
+                if not exists[b, k]:
                     assert not network.known[b, k, j]
                     continue
                 known = k == 0 if j < OBS else k < delay[b]
@@ -214,14 +223,15 @@ def test_loss_against_a_naive_computation(prediction, schedule, relative):
                     total += weight[b] * share * (network.output[b, k, j] - target) ** 2
                     count += share
     th.testing.assert_close(loss, total / count, atol=1e-5, rtol=1e-5)
-    assert th.equal(network.valid, windows.valid) and th.equal(network.t, t)
+    assert th.equal(network.valid, exists) and th.equal(network.t, t)
 
 
 def test_loss_has_no_gradient_at_known_and_padded_entries():
     planner, windows = make_planner(), make_windows()
     planner.network = network = FakeNetwork(th.randn(6, LENGTH, OBS + ACT, requires_grad=True))
-    planner.loss(windows, th.tensor([0, 1, 2, 3, 4, 4]), generator=seeded()).backward()
-    learned = windows.valid[..., None] & ~network.known
+    delay = th.tensor([0, 1, 2, 3, 4, 4])
+    planner.loss(windows, delay, generator=seeded()).backward()
+    learned = existing(windows, delay)[..., None] & ~network.known
     assert th.equal(network.output.grad != 0, learned) and not learned.all()
 
 
@@ -363,7 +373,7 @@ def test_selection_scores_the_right_states_and_takes_the_best(scored_states):
         first = d + 1 if scored_states == "future" else 1
         scores = []
         for n in range(7):
-            marks = [value_fn(plan.states[b, n, k], plan.actions[b, n, k]) for k in range(first, LENGTH)]
+            marks = [value_fn(plan.states[b, n, k], plan.actions[b, n, k]) for k in range(first, d + SMALL.horizon)]
             scores.append(sum(marks) / len(marks))
         th.testing.assert_close(plan.values[b], th.stack(scores), atol=1e-5, rtol=1e-4)
         best.append(int(th.stack(scores).argmax()))
@@ -425,7 +435,22 @@ def test_decisions_and_candidates_do_not_disturb_each_other():
     th.testing.assert_close(permuted.states, together.states[order][:, [2, 0, 1]], atol=1e-4, rtol=1e-4)
     for b in range(6):
         alone = planner.plan(observation[b : b + 1], history[b : b + 1], delay[b : b + 1], noise=noise)
-        th.testing.assert_close(alone.states[0], together.states[b], atol=1e-4, rtol=1e-4)
+        length = int(delay[b]) + SMALL.horizon  # the others' larger delays make its window no longer
+        assert alone.states.shape[2] == length
+        th.testing.assert_close(alone.states[0], together.states[b, :, :length], atol=1e-4, rtol=1e-4)
+
+
+def test_a_decision_costs_what_its_age_costs():
+    planner = make_planner()
+    observation, history, _ = make_batch(1)
+    costs = []
+    for d in range(DELAY + 1):
+        with FlopCounterMode(display=False) as counter:
+            planner.plan(observation, history, th.tensor([d]), temperature=0.0)
+        costs.append(counter.get_total_flops())
+    # Linear in the window's length d + horizon, but for the attention's small square and what is made once
+    slopes = np.diff(costs) / costs[-1]
+    assert (slopes > 0.8 / (DELAY + SMALL.horizon)).all() and (slopes < 1.3 / (DELAY + SMALL.horizon)).all()
 
 
 def test_state_dict_carries_weights_and_statistics():

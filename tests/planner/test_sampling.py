@@ -80,17 +80,18 @@ def naive_network(net, x, context, t):
 
 @th.no_grad()
 def naive_plan(planner, observation, history, d, noise):
-    """DDIM, window after window: (N, L, OBS) and (N, L, ACT), in the planner's units."""
+    """DDIM, window after window of d + horizon steps: (N, d + horizon, OBS + ACT), in the planner's units."""
+    length = d + planner.config.horizon
     times = th.linspace(END_TIMES["cosine"], START_TIME, planner.config.sampling_steps + 1, dtype=th.float64)
-    known = th.zeros(LENGTH, OBS + ACT, dtype=th.bool)
+    known = th.zeros(length, OBS + ACT, dtype=th.bool)
     known[0, :OBS], known[:d, OBS:] = True, True
-    given = th.zeros(LENGTH, OBS + ACT)
+    given = th.zeros(length, OBS + ACT)
     given[0, :OBS] = observation
     given[:d, OBS:] = history[DELAY - d :]
     clean = planner.normalizer.normalize(given[:, :OBS], given[:, OBS:])
     context = planner.network.context(clean[None], known[None])[0]
     windows = []
-    for x in planner.config.temperature * noise:
+    for x in planner.config.temperature * noise[:, :length]:
         x = th.where(known, clean, x)
         for now, after in itertools.pairwise(times):
             v = naive_network(planner.network, x, context, now.float())
@@ -112,8 +113,8 @@ def test_fast_path_gives_what_a_naive_one_gives():
     for b, d in enumerate(delay.tolist()):
         x = naive_plan(planner, observation[b], history[b], d, noise)
         states, actions = planner.normalizer.denormalize(x)
-        assert ((plan.states[b] - states) / planner.normalizer.state_std).abs().max() < 1e-4
-        th.testing.assert_close(plan.actions[b], actions, atol=1e-4, rtol=1e-4)
+        assert ((plan.states[b, :, : states.shape[1]] - states) / planner.normalizer.state_std).abs().max() < 1e-4
+        th.testing.assert_close(plan.actions[b, :, : states.shape[1]], actions, atol=1e-4, rtol=1e-4)
         values = value(states, actions)[:, d + 1 :].mean(1)
         th.testing.assert_close(plan.values[b], values, atol=1e-3, rtol=1e-3)
         chosen.append(int(values.argmax()))

@@ -154,7 +154,7 @@ def naive_loss(planner, source, config, generator):
     times = draw_times(n, config.schedule, config.time_sampling, generator)
     error, total = 0.0, 0.0
     for start, d, eps, t in zip(starts.tolist(), delays.tolist(), noise.double(), times.double(), strict=True):
-        steps = range(min(length, int(source.remaining[start])))
+        steps = range(min(d + config.horizon, int(source.remaining[start])))
         row, env = int(source.rows[start]), source.envs[start]
         pairs = [(source.states[row + k, env], source.actions[row + k, env]) for k in steps]
         states, actions = (th.stack(part).double() for part in zip(*pairs, strict=True))
