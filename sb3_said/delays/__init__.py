@@ -1,6 +1,33 @@
-"""The delayed world, NumPy only: delay processes and the observation wrapper."""
+"""The delayed world, NumPy only: delay processes, receivers, the observation wrapper, and the delay of a log."""
 
-from sb3_said.delays.processes import DelayProcess, EpisodeDelay, FixedDelay
+from sb3_said.delays.combined import DroppedPackets, HeldDelay, PeriodicPackets, TotalDelay
+from sb3_said.delays.estimation import DelayEstimate, estimate_delay
+from sb3_said.delays.processes import (
+    WIFI_20MS,
+    DelayProcess,
+    DistributionDelay,
+    EpisodeDelay,
+    FixedDelay,
+    RandomWalkDelay,
+    UniformDelay,
+    in_steps,
+)
 from sb3_said.delays.wrapper import DelayedObservationWrapper
 
-__all__ = ["DelayProcess", "DelayedObservationWrapper", "EpisodeDelay", "FixedDelay"]
+__all__ = [
+    "WIFI_20MS",
+    "DelayEstimate",
+    "DelayProcess",
+    "DelayedObservationWrapper",
+    "DistributionDelay",
+    "DroppedPackets",
+    "EpisodeDelay",
+    "FixedDelay",
+    "HeldDelay",
+    "PeriodicPackets",
+    "RandomWalkDelay",
+    "TotalDelay",
+    "UniformDelay",
+    "estimate_delay",
+    "in_steps",
+]

@@ -1,7 +1,14 @@
-"""How old the newest observation is: delay processes, seeded by the wrapper that owns them."""
+"""How long packets take: delay processes for observations and for actions, seeded by whoever owns them.
+
+A process is an immutable description. It can be shared between environments and compared; all that changes within an
+episode is in the iterator that ``sample`` returns.
+"""
 
 from __future__ import annotations
 
+import bisect
+import itertools
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -9,29 +16,33 @@ import numpy as np
 
 
 class DelayProcess(Protocol):
-    """Draws the observation delay of an episode."""
+    """Draws how many control steps the packets of an episode take."""
 
     @property
     def max_delay(self) -> int:
-        """Largest delay that can be drawn, in control steps."""
+        """Largest age that can occur, in control steps."""
 
-    def sample(self, rng: np.random.Generator) -> int:
-        """Draw the delay of the coming episode, in control steps."""
+    def sample(self, rng: np.random.Generator) -> int | Iterator[int | None]:
+        """Draw the delays of the coming episode, in control steps.
+
+        :return: one integer for all packets of the episode, or an iterator over the delays of the packets sent at
+            steps 1, 2, ..., with None for a packet that never arrives
+        """
 
 
 @dataclass(frozen=True)
 class FixedDelay:
     """The same delay in every episode.
 
-    :param delay: age of the newest observation, in control steps, >= 0
-    :raises ValueError: for a negative delay
+    :param delay: in control steps, >= 0
+    :raises ValueError: for a negative or fractional delay
     """
 
     delay: int
 
     def __post_init__(self) -> None:
-        if self.delay < 0:
-            raise ValueError(f"A delay is a number of control steps >= 0, got {self.delay}.")
+        if not (_is_integer(self.delay) and self.delay >= 0):
+            raise ValueError(f"A delay is a whole number of control steps >= 0, got {self.delay}.")
 
     @property
     def max_delay(self) -> int:
@@ -42,27 +53,145 @@ class FixedDelay:
 
 
 @dataclass(frozen=True)
-class EpisodeDelay:
-    """A delay drawn uniformly from ``low..high`` (both included) at every reset.
-
-    :param low: smallest delay, in control steps, >= 0
-    :param high: largest delay, in control steps, >= low
-    :raises ValueError: for a negative or empty range
-    """
+class _Range:
+    """What processes over ``low..high`` share."""
 
     low: int
     high: int
 
     def __post_init__(self) -> None:
-        if not 0 <= self.low <= self.high:
-            raise ValueError(f"A delay range is (low, high) with 0 <= low <= high, got ({self.low}, {self.high}).")
+        if not (_is_integer(self.low) and _is_integer(self.high) and 0 <= self.low <= self.high):
+            raise ValueError(
+                f"A delay range is (low, high), whole numbers with 0 <= low <= high, got ({self.low}, {self.high})."
+            )
 
     @property
     def max_delay(self) -> int:
         return self.high
 
+
+@dataclass(frozen=True)
+class EpisodeDelay(_Range):
+    """A delay drawn uniformly from ``low..high`` (both included) at every reset.
+
+    :param low: smallest delay, in control steps, >= 0
+    :param high: largest delay, in control steps, >= low
+    :raises ValueError: for a negative, fractional or empty range
+    """
+
     def sample(self, rng: np.random.Generator) -> int:
         return int(rng.integers(self.low, self.high + 1))
+
+
+@dataclass(frozen=True)
+class UniformDelay(_Range):
+    """A delay drawn uniformly from ``low..high`` (both included) for every packet.
+
+    :param low: smallest delay, in control steps, >= 0
+    :param high: largest delay, in control steps, >= low
+    :raises ValueError: for a negative, fractional or empty range
+    """
+
+    def sample(self, rng: np.random.Generator) -> Iterator[int]:
+        while True:
+            yield int(rng.integers(self.low, self.high + 1))
+
+
+@dataclass(frozen=True)
+class DistributionDelay:
+    """A delay drawn for every packet from any distribution P(t) over 0..D (the DOMDP of the paper, section 2).
+
+    :param probabilities: P(0), P(1), ..., P(D)
+    :raises ValueError: for probabilities that are negative or do not add up to 1
+
+    >>> DistributionDelay((0.5, 0.25, 0.25)).max_delay
+    2
+    """
+
+    probabilities: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        p = np.asarray(self.probabilities, dtype=np.float64)
+        if not (p.ndim == 1 and np.all(p >= 0) and abs(p.sum() - 1.0) < 1e-6):
+            raise ValueError(
+                f"The probabilities of the delays 0, 1, 2, ... are >= 0 and add up to 1, got {self.probabilities}."
+            )
+        object.__setattr__(self, "probabilities", tuple(p.tolist()))  # a list (from YAML) has no hash
+
+    @classmethod
+    def from_samples(cls, delays: Iterable[int]) -> DistributionDelay:
+        """Take the distribution of measured delays, in control steps (see ``in_steps``).
+
+        :raises ValueError: for no, negative or fractional delays
+        """
+        drawn = np.asarray(list(delays))
+        if drawn.size == 0 or not np.issubdtype(drawn.dtype, np.integer) or drawn.min() < 0:
+            raise ValueError(
+                f"Measured delays are whole numbers of control steps >= 0, got {drawn}; "
+                "in_steps(milliseconds, control_period) makes them."
+            )
+        return cls(tuple(np.bincount(drawn) / len(drawn)))
+
+    @property
+    def max_delay(self) -> int:
+        return int(np.flatnonzero(self.probabilities)[-1])
+
+    def sample(self, rng: np.random.Generator) -> Iterator[int]:
+        cumulative = list(itertools.accumulate(self.probabilities[: self.max_delay]))
+        while True:
+            yield bisect.bisect_right(cumulative, rng.random())
+
+
+#: 10,000 measured WiFi communications in control steps of 20 ms (Bouteiller et al., Reinforcement Learning with Random
+#: Delays, ICLR 2021; the first sampler of its code). It stands for one direction: observations, or actions.
+WIFI_20MS = DistributionDelay((0.0, 0.3082, 0.5927, 0.0829, 0.0075, 0.0031, 0.0056))
+
+
+@dataclass(frozen=True)
+class RandomWalkDelay(_Range):
+    """A delay that drifts: one step up or down with probability ``move_prob``, starting anywhere in ``low..high``.
+
+    A move out of the range is not made, so that all delays are equally frequent in the long run.
+
+    :param low: smallest delay, in control steps, >= 0
+    :param high: largest delay, in control steps, >= low
+    :param move_prob: probability that the delay moves between one packet and the next, half of it upwards
+    :raises ValueError: for a negative, fractional or empty range, or a probability outside 0..1
+    """
+
+    move_prob: float = 0.1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_probability("move_prob", self.move_prob)
+
+    def sample(self, rng: np.random.Generator) -> Iterator[int]:
+        delay = int(rng.integers(self.low, self.high + 1))
+        while True:
+            yield delay
+            u = rng.random()
+            if u < self.move_prob:
+                step = 1 if u < 0.5 * self.move_prob else -1
+                delay = min(max(delay + step, self.low), self.high)
+
+
+def in_steps(milliseconds: float | np.ndarray, control_period: float) -> int | np.ndarray:
+    """Convert delays to control steps, rounded up: what arrives between two steps is seen at the later one.
+
+    :param milliseconds: a delay, or an array of them, >= 0
+    :param control_period: of one control step, in milliseconds, > 0
+    :raises ValueError: for negative or non-finite delays, or a control period that is not positive
+
+    >>> FixedDelay(in_steps(70, control_period=20))
+    FixedDelay(delay=4)
+    """
+    delays = np.asarray(milliseconds, dtype=np.float64)
+    if not (np.all(np.isfinite(delays)) and np.all(delays >= 0) and 0 < control_period < np.inf):
+        raise ValueError(
+            f"Delays are >= 0 ms and the control period is > 0 ms, got {milliseconds} and {control_period}."
+        )
+    steps = np.ceil(np.round(delays / control_period, 9)).astype(np.int64)  # 0.3 / 0.1 is a bit above 3
+    return int(steps) if steps.ndim == 0 else steps
 
 
 def make_process(delay: int | tuple[int, int] | DelayProcess) -> DelayProcess:
@@ -77,7 +206,56 @@ def make_process(delay: int | tuple[int, int] | DelayProcess) -> DelayProcess:
         return EpisodeDelay(int(delay[0]), int(delay[1]))
     if hasattr(delay, "sample") and hasattr(delay, "max_delay"):
         return delay  # type: ignore[return-value]  # a protocol with a property cannot be narrowed to by hasattr
-    raise ValueError(f"`delay` is an integer, a (low, high) pair of integers or a delay process, got {delay!r}.")
+    raise ValueError(
+        "`delay` is an integer, a (low, high) pair of integers or a delay process (with max_delay and sample(rng)), "
+        f"got {delay!r}."
+    )
+
+
+def packet_delays(process: DelayProcess, rng: np.random.Generator) -> Iterator[int | None]:
+    """Draw an episode from a process: the delays of the packets sent at steps 1, 2, ...; None for one that is lost.
+
+    :raises ValueError: when the process draws anything but integers in 0..max_delay, at once or on the way
+    """
+    drawn = process.sample(rng)
+    if isinstance(drawn, Iterator):
+        return _checked(process, drawn)
+    return itertools.repeat(check_draw(drawn, process, process.max_delay))
+
+
+def _checked(process: DelayProcess, delays: Iterator[int | None]) -> Iterator[int | None]:
+    max_delay = process.max_delay
+    for delay in delays:
+        yield None if delay is None else check_draw(delay, process, max_delay)
+    raise ValueError(f"{process!r} ran out of delays amid an episode; its iterator must have no end.")
+
+
+def check_draw(delay: int, process: DelayProcess, max_delay: int) -> int:
+    """Return a delay that a process drew.
+
+    :raises ValueError: unless it is an integer in 0..max_delay
+    """
+    if not (_is_integer(delay) and 0 <= delay <= max_delay):
+        raise ValueError(f"{process!r} drew a delay of {delay}, expected a whole number in 0..{max_delay}.")
+    return int(delay)
+
+
+def check_probability(name: str, p: float) -> None:
+    """Refuse what is no probability.
+
+    :raises ValueError: saying what was given
+    """
+    if not 0.0 <= p <= 1.0:
+        raise ValueError(f"{name} is a probability in 0..1, got {p}.")
+
+
+def check_count(name: str, n: int, smallest: int) -> None:
+    """Refuse what is no integer, or a too small one.
+
+    :raises ValueError: saying what was given
+    """
+    if not (_is_integer(n) and n >= smallest):
+        raise ValueError(f"{name} is a whole number >= {smallest}, got {n}.")
 
 
 def _is_integer(x: object) -> bool:

@@ -9,7 +9,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_said.delays.combined import TotalDelay
 from sb3_said.delays.processes import DelayProcess, make_process
+from sb3_said.delays.receivers import RECEIVERS
 
 #: Keeps the delays' random numbers apart from those that the task draws from the same seed.
 DELAY_STREAM = 1
@@ -18,26 +20,33 @@ DELAY_STREAM = 1
 class DelayedObservationWrapper(
     gym.Wrapper[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray], gym.utils.RecordConstructorArgs
 ):
-    """Delay a task's observations by some control steps; rewards and episode ends stay undelayed.
+    """Delay a task's observations and actions by some control steps; rewards and episode ends stay undelayed.
 
     The observation becomes a dict of float32 arrays:
 
     - ``observation`` (obs_dim,): s_{t-age}, the newest observation that has arrived;
     - ``action_history`` (D, act_dim): the D newest actions a_{t-D..t-1}, oldest first, scaled to [-1, 1] from the
       bounds of the action space, zeros before the episode;
-    - ``delay`` (1,): the age of ``observation`` in control steps.
+    - ``delay`` (1,): the age of ``observation`` in control steps, plus those that actions take.
 
     At reset s_0 arrives with age 0, and ages while it is all that has arrived, so an episode starts as a task with a
-    smaller delay. ``info["undelayed_observation"]`` is the true state after the step, for replay and diagnosis only.
+    smaller delay. ``info["undelayed_observation"]`` is the true state after the step, for replay and diagnosis only;
+    ``info["forced_deliveries"]`` counts the packets of the episode that were delivered only because the age would have
+    exceeded the largest delay.
 
     ``gymnasium.wrappers.DelayObservation`` returns zeros before the first observation arrives, and neither the actions
     sent since nor the age, without which the process is not Markov (paper, Theorem 2.1).
 
     :param env: a task with a 1-D Box observation and a bounded Box action
     :param delay: d >= 0 control steps; or ``(low, high)``, drawn uniformly at every reset; or a delay process
+    :param action_delay: control steps from choosing an action to its execution: >= 0; or ``(low, high)`` or a process
+        that draws one delay an episode. Time is the actuator's: the action is executed in the true state, and
+        observations look older by as much. The task starts when the first action arrives.
     :param max_delay: D, length of the action history; the largest delay by default. A larger one serves a model that
         was built for it.
-    :raises ValueError: for other spaces, a bad delay, or a ``max_delay`` below the largest delay
+    :param receiver: ``"newest"`` keeps the newest observation that has arrived; ``"independent"`` reads an age drawn
+        anew at every step (paper, section 2)
+    :raises ValueError: for other spaces, a bad delay, an unknown receiver, or a ``max_delay`` below the largest delay
 
     >>> env = DelayedObservationWrapper(gym.make("Pendulum-v1"), delay=2)
     >>> obs, info = env.reset(seed=0)
@@ -51,9 +60,17 @@ class DelayedObservationWrapper(
     """
 
     def __init__(
-        self, env: gym.Env[Any, Any], delay: int | tuple[int, int] | DelayProcess = 4, *, max_delay: int | None = None
+        self,
+        env: gym.Env[Any, Any],
+        delay: int | tuple[int, int] | DelayProcess = 4,
+        action_delay: int | tuple[int, int] | DelayProcess = 0,
+        *,
+        max_delay: int | None = None,
+        receiver: str = "newest",
     ):
-        gym.utils.RecordConstructorArgs.__init__(self, delay=delay, max_delay=max_delay)
+        gym.utils.RecordConstructorArgs.__init__(
+            self, delay=delay, action_delay=action_delay, max_delay=max_delay, receiver=receiver
+        )
         gym.Wrapper.__init__(self, env)
         obs_space, act_space = env.observation_space, env.action_space
         if not (isinstance(obs_space, spaces.Box) and len(obs_space.shape) == 1):
@@ -71,10 +88,13 @@ class DelayedObservationWrapper(
                 f"DelayedObservationWrapper scales actions by their bounds, but low and high are equal in {act_space}; "
                 "leave out the action entries that cannot vary."
             )
-        self.process = make_process(delay)
+        self.process = make_process(delay) if action_delay == 0 else TotalDelay(delay, action_delay)
         self.max_delay = self.process.max_delay if max_delay is None else max_delay
         if self.max_delay < self.process.max_delay:
             raise ValueError(f"max_delay={max_delay} is smaller than the largest delay {self.process.max_delay}.")
+        if receiver not in RECEIVERS:
+            raise ValueError(f"receiver is {receiver!r}, expected one of {tuple(RECEIVERS)}.")
+        self.receiver = RECEIVERS[receiver](self.process)
 
         self._action_low, self._action_span = act_space.low, act_space.high - act_space.low
         self._action_is_scaled = bool(np.all(act_space.low == -1) and np.all(act_space.high == 1))
@@ -86,8 +106,6 @@ class DelayedObservationWrapper(
             delay=spaces.Box(0.0, float(self.max_delay), (1,), np.float32),
         )
         self._rng = np.random.default_rng()
-        self._delay = 0
-        self._age = 0
         self._states: deque[np.ndarray] = deque(maxlen=self.max_delay + 1)
         self._history = np.zeros((self.max_delay, *act_space.shape), np.float32)
 
@@ -97,43 +115,45 @@ class DelayedObservationWrapper(
         """Reset the task; s_0 arrives at once.
 
         :param seed: seeds the task and the delay process
-        :raises ValueError: when the process draws a delay outside 0..D
+        :raises ValueError: when the process draws a delay outside 0..max_delay
         """
         state: Any
         state, info = self.env.reset(seed=seed, options=options)
         if seed is not None:
             self._rng = np.random.default_rng([seed, DELAY_STREAM])
-        self._delay = self.process.sample(self._rng)
-        if not 0 <= self._delay <= self.max_delay:
-            raise ValueError(f"{self.process!r} drew a delay of {self._delay}, outside 0..{self.max_delay}.")
-        self._age = 0
+        self.receiver.reset(self._rng)
         self._states.clear()
         self._history[:] = 0.0
-        return self._observe(state), self._with_state(info)
+        return self._observe(state, age=0), self._with_state(info)
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict[str, Any]]:
         """Execute the action now; observe what has arrived.
 
         :param action: (act_dim,), in the units of the action space
+        :raises ValueError: when the process draws a delay outside 0..max_delay
         """
         state: Any
         state, reward, terminated, truncated, info = self.env.step(action)
         if self.max_delay > 0:
             self._history[:-1] = self._history[1:]
             self._history[-1] = self._scale(action)
-        self._age = min(self._age + 1, self._delay)
-        return self._observe(state), reward, terminated, truncated, self._with_state(info)
+        obs = self._observe(state, age=self.receiver.step())
+        return obs, reward, terminated, truncated, self._with_state(info)
 
-    def _observe(self, state: np.ndarray) -> dict[str, np.ndarray]:
+    def _observe(self, state: np.ndarray, age: int) -> dict[str, np.ndarray]:
         self._states.append(np.asarray(state, dtype=np.float32).copy())
         return {
-            "observation": self._states[-1 - self._age].copy(),
+            "observation": self._states[-1 - age].copy(),
             "action_history": self._history.copy(),
-            "delay": np.array([self._age], dtype=np.float32),
+            "delay": np.array([age], dtype=np.float32),
         }
 
     def _with_state(self, info: dict[str, Any]) -> dict[str, Any]:
-        return {**info, "undelayed_observation": self._states[-1].copy()}
+        return {
+            **info,
+            "undelayed_observation": self._states[-1].copy(),
+            "forced_deliveries": self.receiver.forced_deliveries,
+        }
 
     def _scale(self, action: np.ndarray) -> np.ndarray:
         """Scale from the action space to [-1, 1]; bit for bit the same where it has these bounds already."""

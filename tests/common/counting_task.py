@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_said.delays import DelayedObservationWrapper
+from sb3_said.delays import DelayedObservationWrapper, DelayProcess
 
 OBS_DIM, ACT_DIM = 3, 2
 
@@ -73,12 +73,14 @@ class Player:
     """Plays random actions in parallel tasks.
 
     :param delay: of the wrapper, or None for the tasks as they are
+    :param receiver: of the wrapper
     :param interruption: probability of a reset after a step, as when a run is resumed
     """
 
     n_envs: int = 2
-    delay: int | tuple[int, int] | None = 2
+    delay: int | tuple[int, int] | DelayProcess | None = 2
     max_delay: int | None = None
+    receiver: str = "newest"
     max_length: int = 9
     interruption: float = 0.0
     seed: int = 0
@@ -89,7 +91,9 @@ class Player:
 
         def make() -> gym.Env:
             task = CountingTask(counter, self.max_length)
-            return task if self.delay is None else DelayedObservationWrapper(task, self.delay, max_delay=self.max_delay)
+            if self.delay is None:
+                return task
+            return DelayedObservationWrapper(task, self.delay, max_delay=self.max_delay, receiver=self.receiver)
 
         self.vec = DummyVecEnv([make] * self.n_envs)
         self.vec.seed(self.seed)

@@ -9,6 +9,7 @@ from counting_task import ACT_DIM, OBS_DIM, Player, Row
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_processes import processes
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.save_util import load_from_pkl, save_to_pkl
 from stable_baselines3.common.vec_env import VecNormalize
@@ -104,6 +105,14 @@ def test_samples_are_the_transitions_themselves(player_and_size, n_steps):
     player, steps_per_env = player_and_size
     rows = player.play(n_steps)
     assert_exact(fill(make_buffer(player, steps_per_env), rows), rows)
+
+
+@settings(max_examples=100, deadline=None)
+@given(processes(), st.sampled_from(["newest", "independent"]), st.integers(0, 2**16), st.integers(2, 20))
+def test_samples_are_the_transitions_themselves_however_ages_jump(process, receiver, seed, spare):
+    player = Player(delay=process, receiver=receiver, max_length=25, interruption=0.05, seed=seed)
+    rows = player.play(70)
+    assert_exact(fill(make_buffer(player, process.max_delay + spare), rows), rows)
 
 
 @settings(max_examples=60, deadline=None)

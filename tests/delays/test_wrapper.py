@@ -1,6 +1,7 @@
 """The delayed world: exact ages, histories and true states at every step of whole episodes."""
 
 import copy
+from collections import deque
 from functools import partial
 
 import gymnasium as gym
@@ -8,12 +9,23 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env as check_gymnasium_env
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from random_processes import processes
 from stable_baselines3.common.env_checker import check_env as check_sb3_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
-from sb3_said.delays import DelayedObservationWrapper, EpisodeDelay, FixedDelay
+from sb3_said.delays import (
+    WIFI_20MS,
+    DelayedObservationWrapper,
+    DroppedPackets,
+    EpisodeDelay,
+    FixedDelay,
+    UniformDelay,
+)
+from sb3_said.delays.receivers import RECEIVERS, IndependentDraw
 
 LOW, HIGH = np.array([-2.0, 0.0], np.float32), np.array([2.0, 8.0], np.float32)
 
@@ -56,11 +68,19 @@ class TableDelay:
         return next(self.draws)
 
 
+def delay_of_episode(receiver):
+    """Of a process that draws one delay for all packets of an episode."""
+    return next(receiver._delays)
+
+
 def assert_observation(obs, task, delay, max_delay):
     """Compare with the log: s_{t-min(t, d)}, the actions a_{t-D..t-1} and nothing younger or older."""
+    assert_age(obs, task, min(len(task.actions[-1]), delay), max_delay)
+
+
+def assert_age(obs, task, age, max_delay):
     states, actions = task.states[-1], task.actions[-1]
     t = len(actions)
-    age = min(t, delay)
     assert obs["delay"].tolist() == [age]
     np.testing.assert_array_equal(obs["observation"], states[t - age])
     history = np.zeros((max_delay, 2))
@@ -86,20 +106,63 @@ def test_every_step_of_whole_episodes(delay, max_delay, dtype):
     drawn = set()
     for episode in range(12):
         obs, info = env.reset(seed=0 if episode == 0 else None, options={"n": episode})
-        drawn.add(env._delay)
-        assert_observation(obs, task, env._delay, max_delay)
+        episode_delay = delay_of_episode(env.receiver)
+        drawn.add(episode_delay)
+        assert_observation(obs, task, episode_delay, max_delay)
         assert info["options"] == {"n": episode}
         np.testing.assert_array_equal(info["undelayed_observation"], task.states[-1][0])
         for t in range(1, task.length + 1):
             action = env.action_space.sample()
             obs, reward, terminated, truncated, info = env.step(action)
-            assert_observation(obs, task, env._delay, max_delay)
+            assert_observation(obs, task, episode_delay, max_delay)
             # the reward and the end are this step's, as old as the observation may be
             assert (reward, terminated, truncated, info["t"]) == (float(action[0]), t == task.length, False, t)
             np.testing.assert_array_equal(info["undelayed_observation"], task.states[-1][-1])
     low, high = delay if isinstance(delay, tuple) else (delay, delay)
     assert drawn <= set(range(low, high + 1))
     assert len(drawn) > 1 or low == high
+
+
+@settings(deadline=None)
+@given(processes(), st.sampled_from(sorted(RECEIVERS)), st.integers(0, 2), st.integers(0, 2**16))
+def test_every_step_under_any_process(process, receiver, spare, seed):
+    task = LoggedTask(length=25)
+    max_delay = process.max_delay + spare
+    env = DelayedObservationWrapper(task, process, max_delay=max_delay, receiver=receiver)
+    log = RECEIVERS[receiver](process)  # itself tested against a log of arrivals
+    rng = np.random.default_rng([seed, 1])
+    env.action_space.seed(seed)
+    for episode in range(3):
+        obs, info = env.reset(seed=seed if episode == 0 else None)
+        log.reset(rng)
+        assert_age(obs, task, 0, max_delay)
+        assert info["forced_deliveries"] == 0
+        for _ in range(task.length):
+            obs, *_, info = env.step(env.action_space.sample())
+            assert_age(obs, task, log.step(), max_delay)
+            assert info["forced_deliveries"] == log.forced_deliveries
+            np.testing.assert_array_equal(info["undelayed_observation"], task.states[-1][-1])
+
+
+def test_losses_that_were_delivered_are_counted():
+    env = DelayedObservationWrapper(LoggedTask(length=100), DroppedPackets(1, p=1.0, max_losses=2))
+    env.reset(seed=0)
+    steps = [env.step(env.action_space.sample()) for _ in range(6)]
+    assert [obs["delay"].item() for obs, *_ in steps] == [1, 2, 3, 3, 3, 3]
+    assert [info["forced_deliveries"] for *_, info in steps] == [0, 0, 0, 1, 2, 3]
+
+
+def test_tasks_of_the_same_seed_do_not_depend_on_the_delay():
+    states = []
+    for delay in (0, 3, (0, 8), UniformDelay(0, 8), DroppedPackets(WIFI_20MS, p=0.3)):
+        task = LoggedTask()
+        env = DelayedObservationWrapper(task, delay)
+        env.reset(seed=5)
+        for _ in range(task.length):
+            env.step(np.zeros(2, np.float32))
+        states.append(np.array(task.states))
+    for others in states[1:]:
+        np.testing.assert_array_equal(others, states[0])
 
 
 def test_earlier_observations_do_not_change():
@@ -140,7 +203,7 @@ def test_seeds():
         drawn = []
         for episode in range(n):
             obs, _ = env.reset(seed=seed if episode == 0 else None)
-            drawn.append((env._delay, *obs["observation"]))
+            drawn.append((delay_of_episode(env.receiver), *obs["observation"]))
         return drawn
 
     assert delays(1) == delays(1)
@@ -151,10 +214,10 @@ def test_seeds():
 def test_parallel_environments_draw_their_own_delays():
     vec = make_vec_env(lambda: DelayedObservationWrapper(LoggedTask(), (0, 50)), n_envs=4, seed=0)
     vec.reset()
-    assert len(set(vec.get_attr("_delay"))) > 1
+    assert len(set(map(delay_of_episode, vec.get_attr("receiver")))) > 1
 
 
-@pytest.mark.parametrize("delay", [0, 3, (0, 8)])
+@pytest.mark.parametrize("delay", [0, 3, (0, 8), DroppedPackets(UniformDelay(0, 4), p=0.2)])
 @pytest.mark.parametrize("name", ["Pendulum-v1", "Hopper-v5"])
 @pytest.mark.filterwarnings("ignore::UserWarning")  # both recommend other bounds, of the tasks themselves
 def test_checkers_of_gymnasium_and_sb3(name, delay):
@@ -166,6 +229,8 @@ def test_made_again_from_its_spec():
     env = gym.make(DelayedObservationWrapper(gym.make("Pendulum-v1"), (1, 3), max_delay=5).spec)
     assert isinstance(env, DelayedObservationWrapper)
     assert (env.process, env.max_delay) == (EpisodeDelay(1, 3), 5)
+    env = gym.make(DelayedObservationWrapper(gym.make("Pendulum-v1"), WIFI_20MS, receiver="independent").spec)
+    assert (env.process, type(env.receiver)) == (WIFI_20MS, IndependentDraw)
 
 
 def make_pendulum(delay):
@@ -230,6 +295,74 @@ def test_wrapping_twice_is_refused():
 def test_max_delay_below_the_delay_is_refused():
     with pytest.raises(ValueError, match="max_delay=3 is smaller than the largest delay 4"):
         DelayedObservationWrapper(LoggedTask(), (0, 4), max_delay=3)
+
+
+# ---------------------------------------------------------------------------------------------------- action delay
+
+
+class Robot:
+    """A task as it is: actions queue up on their way to it, observations on their way back."""
+
+    def __init__(self, name, n_there, n_back, seed):
+        self.env = gym.make(name)
+        self.state = self.env.reset(seed=seed)[0]
+        self.there = deque([None] * n_there)
+        self.back = deque([self.state] * n_back)
+
+    def step(self, action):
+        """One control step: the newest action sets off, the oldest on its way is executed."""
+        self.there.append(action)
+        executed = self.there.popleft()
+        if executed is not None:  # the task starts when the first action arrives
+            self.state = self.env.step(executed)[0]
+        self.back.append(self.state)
+        return self.back.popleft()
+
+
+@pytest.mark.parametrize(("d", "k"), [(0, 3), (3, 0), (2, 4), (4, 2)])
+def test_d_observation_steps_and_k_action_steps_are_d_plus_k_observation_steps(d, k):
+    def policy(observation, t):  # in closed loop, so that a difference would grow
+        return np.clip(np.sin(5 * observation[-3:] + t), -1, 1).astype(np.float32)
+
+    robot = Robot("Hopper-v5", k, d, seed=1)
+    wrappers = [
+        DelayedObservationWrapper(gym.make("Hopper-v5"), d, k),
+        DelayedObservationWrapper(gym.make("Hopper-v5"), d + k),
+        DelayedObservationWrapper(gym.make("Hopper-v5"), FixedDelay(d), (k, k)),
+    ]
+    observations = [env.reset(seed=1)[0] for env in wrappers]
+    observation = np.asarray(robot.state, np.float32)
+    for t in range(15):
+        for obs in observations:
+            np.testing.assert_array_equal(obs["observation"], observation)
+            np.testing.assert_array_equal(obs["action_history"], observations[0]["action_history"])
+            assert obs["delay"].item() == min(t, d + k) and obs["action_history"].shape == (d + k, 3)
+        action = policy(observation, t)
+        observation = np.asarray(robot.step(action), np.float32)
+        observations = [env.step(action)[0] for env in wrappers]
+
+
+def test_action_delays_are_drawn_anew_each_episode():
+    env = DelayedObservationWrapper(LoggedTask(), 2, (0, 5))
+    env.reset(seed=0)
+    drawn = []
+    for _ in range(60):
+        env.reset()
+        drawn.append(delay_of_episode(env.receiver))
+    assert set(drawn) == set(range(2, 8)) and env.max_delay == 7
+
+
+def test_action_delays_of_every_packet_are_refused_with_a_remedy():
+    env = DelayedObservationWrapper(LoggedTask(), 2, WIFI_20MS)
+    with pytest.raises(ValueError, match="write action_delay=6"):
+        env.reset()
+    with pytest.raises(ValueError, match="delay"):
+        DelayedObservationWrapper(LoggedTask(), 2, -1)
+
+
+def test_an_unknown_receiver_is_refused():
+    with pytest.raises(ValueError, match=r"receiver is 'oldest', expected one of \('newest', 'independent'\)"):
+        DelayedObservationWrapper(LoggedTask(), 2, receiver="oldest")
 
 
 def test_a_users_own_process():

@@ -1,0 +1,154 @@
+"""Delay processes made of other processes: held, periodic, lossy, or added up."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from sb3_said.delays.processes import (
+    DelayProcess,
+    check_count,
+    check_draw,
+    check_probability,
+    make_process,
+    packet_delays,
+)
+
+
+@dataclass(frozen=True)
+class HeldDelay:
+    """A delay that stays for a while: another process, asked anew only at times.
+
+    ``HeldDelay(UniformDelay(min_lag, max_lag), hold_prob, update_period)`` draws as the delay buffers of Isaac Lab and
+    mjlab do (there ``update_period=0`` says every step, and the lag is 0 until the first update).
+
+    :param process: draws a new delay when one is due
+    :param hold_prob: probability to keep the last delay when a new one is due
+    :param update_period: a new delay is due every so many packets; the phase is drawn at every reset
+    :raises ValueError: for a probability outside 0..1 or a period below 1
+    """
+
+    process: int | tuple[int, int] | DelayProcess
+    hold_prob: float = 0.0
+    update_period: int = 1
+
+    def __post_init__(self) -> None:
+        make_process(self.process)
+        check_probability("hold_prob", self.hold_prob)
+        check_count("update_period", self.update_period, 1)
+
+    @property
+    def max_delay(self) -> int:
+        return make_process(self.process).max_delay
+
+    def sample(self, rng: np.random.Generator) -> Iterator[int | None]:
+        delays = packet_delays(make_process(self.process), rng)
+        phase = int(rng.integers(self.update_period))
+        delay = next(delays)
+        for packet in itertools.count(1):
+            yield delay
+            if (packet + phase) % self.update_period == 0 and rng.random() >= self.hold_prob:
+                delay = next(delays)
+
+
+@dataclass(frozen=True)
+class PeriodicPackets:
+    """A slow sensor: only every ``period``-th control step sends a packet, the first after reset ``period`` steps on.
+
+    Between packets the age grows: a camera of 10 Hz in a control loop of 50 Hz has ``period=5``.
+
+    :param process: delays of the packets that are sent
+    :param period: control steps from one packet to the next, >= 1
+    :raises ValueError: for a period below 1
+    """
+
+    process: int | tuple[int, int] | DelayProcess
+    period: int
+
+    def __post_init__(self) -> None:
+        make_process(self.process)
+        check_count("period", self.period, 1)
+
+    @property
+    def max_delay(self) -> int:
+        return make_process(self.process).max_delay + self.period - 1
+
+    def sample(self, rng: np.random.Generator) -> Iterator[int | None]:
+        for delay in packet_delays(make_process(self.process), rng):
+            yield from itertools.repeat(None, self.period - 1)
+            yield delay
+
+
+@dataclass(frozen=True)
+class DroppedPackets:
+    """Packets of another process that get lost, each with probability ``p``.
+
+    Ages are bounded: where losses in a row would make the newest observation older than ``max_delay``, the packet of
+    that age is delivered after all, and counted in ``info["forced_deliveries"]``.
+
+    :param process: delays of the packets that are not lost
+    :param p: probability that a packet is lost
+    :param max_losses: how many control steps losses may add to the age: ``max_delay`` is the process's plus this
+    :raises ValueError: for a probability outside 0..1, or ``max_losses`` below 1
+
+    >>> DroppedPackets(4, p=0.1).max_delay
+    8
+    """
+
+    process: int | tuple[int, int] | DelayProcess
+    p: float
+    max_losses: int = 4
+
+    def __post_init__(self) -> None:
+        make_process(self.process)
+        check_probability("p", self.p)
+        check_count("max_losses", self.max_losses, 1)
+
+    @property
+    def max_delay(self) -> int:
+        return make_process(self.process).max_delay + self.max_losses
+
+    def sample(self, rng: np.random.Generator) -> Iterator[int | None]:
+        for delay in packet_delays(make_process(self.process), rng):
+            yield None if rng.random() < self.p else delay
+
+
+@dataclass(frozen=True)
+class TotalDelay:
+    """Observation delay plus action delay.
+
+    An action that takes k steps to the actuator meets the state k steps on. Seen from the actuator, the action is
+    executed as it is chosen, and observations are k steps older: which of the two is delayed makes no difference.
+
+    :param observation: delays of observations
+    :param action: delay of actions, one for all of an episode
+    """
+
+    observation: int | tuple[int, int] | DelayProcess
+    action: int | tuple[int, int] | DelayProcess
+
+    def __post_init__(self) -> None:
+        make_process(self.observation), make_process(self.action)
+
+    @property
+    def max_delay(self) -> int:
+        return make_process(self.observation).max_delay + make_process(self.action).max_delay
+
+    def sample(self, rng: np.random.Generator) -> Iterator[int | None]:
+        """Draw the observation delays from ``rng``, as they are without action delay, the action delay from a child.
+
+        :raises ValueError: for an action process that draws anew for every packet
+        """
+        action, observation = make_process(self.action), make_process(self.observation)
+        added = action.sample(rng.spawn(1)[0])
+        if isinstance(added, Iterator):
+            raise ValueError(
+                f"{action} draws a delay for every packet, but an action delay is one number for all actions of an "
+                f"episode; let the actuator hold each action until {action.max_delay} steps after it was chosen, and "
+                f"write action_delay={action.max_delay}."
+            )
+        k = check_draw(added, action, action.max_delay)
+        return (None if delay is None else delay + k for delay in packet_delays(observation, rng))
