@@ -16,6 +16,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from zoo import ALGOS, WRAPPER
 
+from sb3_said import DelayedSAC
 from sb3_said.delays import FixedDelay
 from sb3_said.evaluation.rollout import Observation
 
@@ -84,6 +85,8 @@ def load_run(
     _check_spaces(model, env, file)
     delay_process = env.get_wrapper_attr("process") if env.has_wrapper_attr("process") else FixedDelay(0)
     env.close()
+    if isinstance(model, DelayedSAC):
+        model.check_delay(repr(delay_process))
     info = {
         "algo": algo,
         "env": env_id,

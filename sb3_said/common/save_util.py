@@ -231,7 +231,11 @@ class SafeSaveMixin(BaseAlgorithm):
                 recursive_setattr(model, f"{name}.data", value)
         if model.use_sde:
             model.policy.reset_noise()  # type: ignore[operator]
+        model._check_loaded()
         return model
+
+    def _check_loaded(self) -> None:
+        """Look at an agent that was just loaded, and at its environment where it was given one."""
 
     def set_parameters(
         self,

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import io
 import pathlib
+import warnings
 from typing import Any, ClassVar
 
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, GymEnv, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import polyak_update
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_said.common.buffers import DelayedReplayBuffer
 from sb3_said.common.checks import check_choice
@@ -78,6 +81,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
         if precision == "bfloat16" and sac_kwargs.get("use_sde"):
             raise ValueError('gSDE is computed in float32: give precision="float32" or "auto" with use_sde=True.')
         self.precision = precision
+        self.trained_delay: str | None = None  # what made the delays it has learned from, written out
         self.augment_state = augment_state
         self.delay_reconciled_critic = delay_reconciled_critic
         if isinstance(policy, str):  # SB3 would refuse one of the two names, by the kind of space
@@ -121,6 +125,47 @@ class DelayedSAC(SafeSaveMixin, SAC):
     def _policy_flags(self) -> dict[str, Any]:
         """Return what the policy's constructor needs of this algorithm's own arguments."""
         return {"augment_state": self.augment_state, "delay_reconciled_critic": self.delay_reconciled_critic}
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        learn = super()._setup_learn(*args, **kwargs)
+        self.trained_delay = self._delay_of(self.env)
+        return learn
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """Take another environment, as SB3 does; see :meth:`check_delay` for one with another delay."""
+        super().set_env(env, force_reset)
+        self.check_delay(self._delay_of(self.env))
+
+    def _check_loaded(self) -> None:
+        if self.env is not None:
+            self.check_delay(self._delay_of(self.env))
+
+    def check_delay(self, delay: str | None) -> None:
+        """Warn where an agent that was trained under one delay is to act under another.
+
+        Ages it has never acted on are not an error, since training can go on with them, but nothing was learned there.
+
+        :param delay: the delay process that it will meet, written out (its ``repr``); None where nothing is delayed
+        """
+        if self.trained_delay is None or delay == self.trained_delay or self._serves_every_delay():
+            return
+        warnings.warn(
+            f"This {type(self).__name__} learned under {self.trained_delay} and is given {delay}: what it does at ages "
+            "it has not met is undefined. Train it on a range, such as delay=(0, 8), or give it the delay it knows.",
+            stacklevel=3,
+        )
+
+    def _serves_every_delay(self) -> bool:
+        """Tell whether answers are as good at ages that training did not bring."""
+        return False
+
+    @staticmethod
+    def _delay_of(env: VecEnv | None) -> str | None:
+        """Write out the delay process of an environment, None without one."""
+        try:
+            return None if env is None else repr(env.get_attr("process")[0])
+        except AttributeError:
+            return None
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Update critics, actor, entropy coefficient and target critics ``gradient_steps`` times, as SAC does."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import asdict, fields
 from itertools import product
 from typing import Any, Literal
 
@@ -165,7 +165,7 @@ class SAIDPolicy(DelayedSACPolicy):
         self.planner.train(mode)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "planner_kwargs": self.planner_kwargs}
+        return {**super()._get_constructor_parameters(), "planner_kwargs": asdict(self.planner.config)}
 
 
 def _rows(observation: PyTorchObs) -> Iterator[PyTorchObs]:

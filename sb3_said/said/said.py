@@ -137,6 +137,10 @@ class SAID(DelayedSAC):
         self.planner_kwargs = {**(self.planner_kwargs or {}), **settings}
         self.policy.planner_kwargs = {**self.policy.planner_kwargs, **settings}
 
+    def _serves_every_delay(self) -> bool:
+        # Its masks were drawn from all of 0..D, over true states that replay has at every age
+        return self.policy.planner_is_trained and self.policy.planner.config.mask == "random"
+
     def warmup(self, batch_size: int = 1) -> None:
         """Answer a few times for nothing: see :meth:`SAIDPolicy.warmup`. A control loop calls it once before it starts.
 

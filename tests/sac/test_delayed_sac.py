@@ -1,6 +1,7 @@
 """DelayedSAC: what each flag makes actor and critics read, SB3's SAC where nothing is delayed, and what it refuses."""
 
 import inspect
+import warnings
 from functools import partial
 
 import numpy as np
@@ -173,6 +174,30 @@ def test_every_argument_has_a_default_and_is_an_attribute():
 def test_both_policy_names_are_the_same_policy(env):
     models = [make(env(), policy=name).learn(40) for name in ("MlpPolicy", "MultiInputPolicy")]
     assert_same_parameters(*models)
+
+
+def test_another_delay_than_it_learned_under_is_never_taken_silently(tmp_path):
+    model = make(delayed(2))
+    model.set_env(delayed((0, 2)))  # has learned nothing yet
+    assert model.trained_delay is None
+    model.learn(30)
+    assert model.trained_delay == "EpisodeDelay(low=0, high=2)"
+    model.save(tmp_path / "agent")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.set_env(delayed((0, 2)))
+        DelayedSAC.load(tmp_path / "agent")
+        DelayedSAC.load(tmp_path / "agent", env=delayed((0, 2)))
+        make(Drift()).learn(30).set_env(Drift())
+    another = r"DelayedSAC learned under EpisodeDelay\(low=0, high=2\) and is given FixedDelay\(delay=2\)"
+    with pytest.warns(UserWarning, match=another):
+        model.set_env(delayed(2))
+    with pytest.warns(UserWarning, match=another):
+        loaded = DelayedSAC.load(tmp_path / "agent", env=delayed(2))
+    loaded.learn(30)  # goes on under the new delay, and knows it from then on
+    assert loaded.trained_delay == "FixedDelay(delay=2)"
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        model.set_env(delayed(3))
 
 
 def test_precision_is_what_was_asked_for():

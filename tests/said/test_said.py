@@ -1,6 +1,7 @@
 """SAID: an expert that learns as DelayedSAC does, a planner that answers, and files that bring back both."""
 
 import inspect
+import warnings
 import zipfile
 from dataclasses import fields
 
@@ -389,6 +390,18 @@ def test_a_loaded_agent_learns_on(saved):
         SAID.load(saved, env=delayed(3))
     with pytest.raises(ValueError, match="Observation spaces do not match"):
         loaded.set_env(make_vec_env(lambda: delayed(3), n_envs=2))
+
+
+def test_only_a_planner_of_every_delay_takes_another_one_silently(trained, saved, tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        SAID.load(saved, env=delayed((0, 2)), device="cpu")
+    fixed, without_planner = make(planner_kwargs={"mask": "fixed"}).learn(80), make().learn(80)
+    without_planner.policy.planner_updates.zero_()
+    for agent in (fixed, without_planner):
+        agent.save(tmp_path / "agent")
+        with pytest.warns(UserWarning, match=r"SAID learned under FixedDelay\(delay=2\) and is given EpisodeDelay"):
+            SAID.load(tmp_path / "agent", env=delayed((0, 2)), device="cpu")
 
 
 def test_parameters_and_policy_are_taken_over(trained, tmp_path):
