@@ -11,6 +11,7 @@ from typing import Any
 
 import gymnasium as gym
 from runs import answering, load_run
+from zoo import add_delay, read_delay
 
 from sb3_said.evaluation import rollout
 
@@ -45,7 +46,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the best")
     parser.add_argument("--algo", help="algorithm of a .zip without its run folder")
     parser.add_argument("--env", help="task to play (default: the trained one)")
-    parser.add_argument("--delay", type=int, help="observation delay in control steps (default: the trained one)")
+    add_delay(parser, default="the trained one")
     parser.add_argument("--device", default="auto", help="torch device (default: auto)")
     return parser
 
@@ -154,7 +155,7 @@ def main(argv: list[str] | None = None) -> None:
         if args.record is not None:
             check_can_record()
         render_mode = "human" if args.record is None else "rgb_array"
-        run = load_run(args.run, args.algo, args.env, args.delay, args.device, {"render_mode": render_mode})
+        run = load_run(args.run, args.algo, args.env, read_delay(args.delay), args.device, {"render_mode": render_mode})
         context = answering(run.model, args.answer)
     except ValueError as error:
         parser.error(str(error))

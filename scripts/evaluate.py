@@ -17,6 +17,7 @@ from typing import Any
 import torch as th
 from runs import LoadedRun, answering, answers, load_run
 from tqdm import tqdm
+from zoo import add_delay, read_delay
 
 from sb3_said.evaluation import Summary, collect_observations, measure_latency, plots, rollout
 
@@ -52,7 +53,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the best")
     parser.add_argument("--algo", help="algorithm of a .zip without its run folder")
     parser.add_argument("--env", help="task to play (default: the trained one)")
-    parser.add_argument("--delay", type=int, help="observation delay in control steps (default: the trained one)")
+    add_delay(parser, default="the trained one")
     parser.add_argument("--latency-calls", type=int, default=200, help="decisions to time, 0 for none (default: 200)")
     parser.add_argument("--json", type=Path, help="where to write the numbers (default: RUN/evaluation.json)")
     parser.add_argument(
@@ -73,7 +74,7 @@ def main(argv: list[str] | None = None) -> None:
     try:
         if args.plot is not None:
             plots.panels()  # without matplotlib, fail now and not after the episodes
-        run = load_run(args.run, args.algo, args.env, args.delay, args.device)
+        run = load_run(args.run, args.algo, args.env, read_delay(args.delay), args.device)
     except ValueError as error:
         parser.error(str(error))
     except ImportError as error:

@@ -14,10 +14,11 @@ from gymnasium import spaces
 from rl_zoo3.utils import get_saved_hyperparams, get_wrapper_class
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
-from zoo import ALGOS, WRAPPER
+from zoo import ALGOS, WRAPPER, Delay
 
 from sb3_said import DelayedSAC
 from sb3_said.delays import FixedDelay
+from sb3_said.delays.processes import make_process
 from sb3_said.evaluation.rollout import Observation
 
 
@@ -40,7 +41,7 @@ def load_run(
     path: str | Path,
     algo: str | None = None,
     env_id: str | None = None,
-    delay: int | None = None,
+    delay: Delay = None,
     device: str = "auto",
     env_kwargs: dict[str, Any] | None = None,
 ) -> LoadedRun:
@@ -52,7 +53,7 @@ def load_run(
     :param path: a run folder such as ``logs/said/Hopper-v5-delay4_1``, or an agent's ``.zip``
     :param algo: name of the algorithm; read from the run folder where there is one
     :param env_id: task to play; the one of the run folder by default
-    :param delay: observation delay to play under, in control steps; the trained one by default
+    :param delay: observation delay to play under; the trained one by default
     :param device: torch device
     :param env_kwargs: more arguments for ``gymnasium.make``, such as ``render_mode``
     :raises ValueError: when the files do not say what to load, or the agent does not fit the task
@@ -149,17 +150,17 @@ def _read_params(params: Path | None) -> tuple[dict[str, Any], dict[str, Any]]:
     return dict(hyperparams), dict(args)
 
 
-def _with_delay(wrappers: list[Any], delay: int | None, model: BaseAlgorithm) -> list[Any]:
+def _with_delay(wrappers: list[Any], delay: Delay, model: BaseAlgorithm) -> list[Any]:
     """Set the delay to play under, keeping the length of the action history that the model reads."""
     space = model.observation_space
     if not isinstance(space, spaces.Dict) or "action_history" not in space.spaces:
-        if delay:
+        if delay is not None and make_process(delay).max_delay > 0:
             raise ValueError(
                 f"This agent reads {space}, not delayed observations: it cannot play with --delay {delay}."
             )
         return wrappers
     max_delay = space["action_history"].shape[0]  # type: ignore[index]  # a Box has a shape
-    if delay is not None and not 0 <= delay <= max_delay:
+    if delay is not None and make_process(delay).max_delay > max_delay:
         raise ValueError(f"This agent was built for delays 0..{max_delay}, got --delay {delay}.")
     kwargs = {"delay": max_delay if delay is None else delay, "max_delay": max_delay}
     names = [next(iter(w)) if isinstance(w, dict) else w for w in wrappers]

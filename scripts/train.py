@@ -8,13 +8,23 @@ import sys
 from pathlib import Path
 
 import rl_zoo3.train
-from zoo import ALGORITHMS, PRESETS, DelayedExperimentManager, Run, default_preset, read_arguments
+from zoo import (
+    ALGORITHMS,
+    PRESETS,
+    DelayedExperimentManager,
+    Run,
+    add_delay,
+    default_preset,
+    read_arguments,
+    read_delay,
+)
 
 EXAMPLES = """
 examples:
   python scripts/train.py --algo said --env Hopper-v5 --delay 4
   python scripts/train.py --algo said --env Ant-v5 --delay 8 --preset paper --seed 1
   python scripts/train.py --algo sadr --env HalfCheetah-v5 --delay 0 8 -n 300000 -P
+  python scripts/train.py --algo said --env Hopper-v5 --delay "DroppedPackets(UniformDelay(0, 8), p=0.1)"
   python scripts/train.py --resume logs/said/Hopper-v5-delay4_1
 
 Runs go to LOG_FOLDER/ALGO/ENV-delayN_K (-f sets LOG_FOLDER); scripts/evaluate.py and scripts/enjoy.py take that folder.
@@ -29,14 +39,7 @@ def parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("-h", "--help", action="store_true", help="show this help, then that of rl_zoo3")
     parser.add_argument("--algo", choices=list(ALGORITHMS), default="said", help="default: said")
-    parser.add_argument(
-        "--delay",
-        type=int,
-        nargs="+",
-        default=[],
-        metavar="STEPS",
-        help="age of observations in control steps; LOW HIGH: drawn anew each episode; default: no delay",
-    )
+    add_delay(parser, default="no delay")
     parser.add_argument(
         "--preset",
         choices=PRESETS,
@@ -63,9 +66,11 @@ def main(argv: list[str]) -> None:
         argv = [*read_arguments(options.resume), *without_resume(argv)]
         resume, (options, zoo_argv) = options.resume, parser().parse_known_args(argv)
         options.resume = resume
-    if len(options.delay) > 2 or any(x < 0 for x in options.delay):
-        parser().error(f"--delay takes N, or LOW HIGH, all >= 0; got {options.delay}")
-    run = Run(argv, options.delay, options.preset, options.checkpoint_freq, options.resume)
+    try:
+        delay = read_delay(options.delay)
+    except ValueError as error:
+        parser().error(str(error))
+    run = Run(argv, delay, options.preset, options.checkpoint_freq, options.resume)
     rl_zoo3.train.ExperimentManager = functools.partial(DelayedExperimentManager, run)  # type: ignore[misc,assignment]
     sys.argv = [sys.argv[0], "--algo", options.algo, *zoo_argv, *(["--help"] if options.help else [])]
     rl_zoo3.train.train()

@@ -37,8 +37,8 @@ class RunConfig:
         return str(getattr(self.args["env"], "gym_id", self.args["env"]))
 
     @property
-    def delay(self) -> list[int]:
-        """What ``--delay`` was given: one number, low and high, or nothing."""
+    def delay(self) -> list[int | str]:
+        """The words given to ``--delay``: one number, low and high, one process, or none."""
         for wrapper in self._wrappers():
             if isinstance(wrapper, dict) and WRAPPER in wrapper:
                 delay = wrapper[WRAPPER]["delay"]

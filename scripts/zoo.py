@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,10 @@ from stable_baselines3.common.logger import Logger, make_output_format
 
 from sb3_said import SAID, DelayedSAC, PlannerTrainingCallback
 from sb3_said.common.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback, restore_training
+from sb3_said.delays.processes import make_process
+
+#: A delay as YAML has it: control steps, [low, high], or a process as text; None for a task without the wrapper.
+Delay = int | list[int] | str | None
 
 CONFIGS = Path(__file__).resolve().parent.parent / "zoo_configs"
 ARGUMENTS_NAME = "train_args.json"
@@ -52,12 +57,42 @@ def default_preset() -> str:
     return "paper" if th.cuda.is_available() else "cpu"
 
 
-def preset_overrides(config: str | Path, preset: str, env_id: str, delay: list[int]) -> dict[str, Any]:
+def add_delay(parser: argparse.ArgumentParser, default: str) -> None:
+    """Give a command line the option ``--delay``, to be read by ``read_delay``.
+
+    :param default: what leaving it out means
+    """
+    parser.add_argument(
+        "--delay",
+        nargs="+",
+        default=[],
+        metavar="STEPS",
+        help="age of observations in control steps; LOW HIGH: drawn anew each episode; or a process of docs/delays.md, "
+        f"such as 'DroppedPackets(4, p=0.1)' (default: {default})",
+    )
+
+
+def read_delay(words: list[str]) -> Delay:
+    """Return what was given to ``--delay`` in the form that YAML and the wrapper take.
+
+    :raises ValueError: for anything but N, LOW HIGH or one process
+    """
+    if not words:
+        return None
+    numbers = [int(word) for word in words if word.removeprefix("-").isdigit()]
+    if len(words) > 2 or len(numbers) not in (0, len(words)) or (not numbers and len(words) > 1):
+        raise ValueError(f"--delay takes N, or LOW HIGH, or one process in quotes, got {' '.join(words)}.")
+    delay: int | list[int] | str = words[0] if not numbers else numbers[0] if len(numbers) == 1 else numbers
+    make_process(delay)
+    return delay
+
+
+def preset_overrides(config: str | Path, preset: str, env_id: str, delay: Delay) -> dict[str, Any]:
     """Return what a preset changes for a task: its own entry of ``presets:`` in the file, or the preset's default.
 
     ``cpu`` is what the file says outside ``presets:``, so that rl_zoo3 alone reads it too.
 
-    :param delay: one number, or low and high; ``planner_by_delay`` is looked up by the largest
+    :param delay: ``planner_by_delay`` is looked up by the largest it can be
     :raises ValueError: for a preset the file does not have
     """
     if preset == "cpu":
@@ -66,7 +101,7 @@ def preset_overrides(config: str | Path, preset: str, env_id: str, delay: list[i
     if preset not in presets:
         raise ValueError(f"{config} has no preset '{preset}', only {['cpu', *presets]}.")
     overrides = dict(presets[preset].get(env_id, presets[preset]["default"]))
-    tuned = overrides.pop("planner_by_delay", {}).get(max(delay, default=0))
+    tuned = overrides.pop("planner_by_delay", {}).get(0 if delay is None else make_process(delay).max_delay)
     if tuned is not None:
         overrides["planner_kwargs"] = {**overrides["planner_kwargs"], "depth": tuned[0], "temperature": tuned[1]}
     return overrides
@@ -77,22 +112,23 @@ class Run:
     """What our command line adds to rl_zoo3's.
 
     :param argv: the command line, so that a resumed run can be set up as it was
-    :param delay: one number, or low and high, in control steps; empty for no wrapper
+    :param delay: what the wrapper is given; None for no wrapper
     :param preset: see ``preset_overrides``
     :param checkpoint_freq: environment steps between checkpoints
     :param resume: folder of the run to continue
     """
 
     argv: list[str]
-    delay: list[int]
+    delay: Delay
     preset: str
     checkpoint_freq: int
     resume: Path | None = None
 
     @property
     def delay_name(self) -> str:
-        """Name of the delay in paths, e.g. ``-delay4`` or ``-delay0-8``."""
-        return "".join(f"-{x}" for x in self.delay).replace("-", "-delay", 1)
+        """Name of the delay in paths, e.g. ``-delay4``, ``-delay0-8`` or ``-delayUniformDelay-0-8``."""
+        words = re.findall(r"[\w.]+", str(self.delay))
+        return "" if self.delay is None else f"-delay{'-'.join(words)}"
 
 
 class DelayedExperimentManager(ExperimentManager):
@@ -115,13 +151,14 @@ class DelayedExperimentManager(ExperimentManager):
 
         overrides = preset_overrides(self.config, run.preset, env_id, run.delay)
         overrides |= ALGORITHMS[algo][1]
-        if run.delay:
-            overrides["env_wrapper"] = [{WRAPPER: {"delay": run.delay[0] if len(run.delay) == 1 else list(run.delay)}}]
+        if run.delay is not None:
+            overrides["env_wrapper"] = [{WRAPPER: {"delay": run.delay}}]
         self.custom_hyperparams = {**overrides, **(self.custom_hyperparams or {})}
         planner_kwargs = self.custom_hyperparams.get("planner_kwargs")
-        if len(run.delay) == 2 and isinstance(planner_kwargs, dict) and planner_kwargs.get("mask") == "fixed":
+        varies = run.delay is not None and not isinstance(run.delay, int)
+        if varies and isinstance(planner_kwargs, dict) and planner_kwargs.get("mask") == "fixed":
             raise ValueError(
-                f"A planner with mask='fixed' serves one delay, got --delay {run.delay[0]} {run.delay[1]}; "
+                f"A planner with mask='fixed' serves one delay, got --delay {run.delay}; "
                 "use mask='random' (another --preset, or -params planner_kwargs:\"dict(mask='random')\")."
             )
 

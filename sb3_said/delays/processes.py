@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import bisect
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -194,21 +194,26 @@ def in_steps(milliseconds: float | np.ndarray, control_period: float) -> int | n
     return int(steps) if steps.ndim == 0 else steps
 
 
-def make_process(delay: int | tuple[int, int] | DelayProcess) -> DelayProcess:
+def make_process(delay: int | Sequence[int] | str | DelayProcess) -> DelayProcess:
     """Turn what a user writes as ``delay`` into a process.
 
-    :param delay: an integer (fixed), a ``(low, high)`` pair (drawn anew each episode) or a process
+    :param delay: an integer (fixed), a ``(low, high)`` pair (drawn anew each episode), a process, or any of these as
+        text (:func:`~sb3_said.delays.written.parse_process`)
     :raises ValueError: for anything else
     """
+    if isinstance(delay, str):
+        from sb3_said.delays.written import parse_process  # which knows the processes made of processes, too
+
+        delay = parse_process(delay)
     if _is_integer(delay):
         return FixedDelay(int(delay))  # type: ignore[arg-type]
     if isinstance(delay, (tuple, list)) and len(delay) == 2 and all(_is_integer(x) for x in delay):
         return EpisodeDelay(int(delay[0]), int(delay[1]))
     if hasattr(delay, "sample") and hasattr(delay, "max_delay"):
-        return delay  # type: ignore[return-value]  # a protocol with a property cannot be narrowed to by hasattr
+        return delay
     raise ValueError(
-        "`delay` is an integer, a (low, high) pair of integers or a delay process (with max_delay and sample(rng)), "
-        f"got {delay!r}."
+        "`delay` is an integer, a (low, high) pair of integers, a delay process (with max_delay and sample(rng)), "
+        f"or one of these as text, got {delay!r}."
     )
 
 

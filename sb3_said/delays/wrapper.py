@@ -38,7 +38,8 @@ class DelayedObservationWrapper(
     sent since nor the age, without which the process is not Markov (paper, Theorem 2.1).
 
     :param env: a task with a 1-D Box observation and a bounded Box action
-    :param delay: d >= 0 control steps; or ``(low, high)``, drawn uniformly at every reset; or a delay process
+    :param delay: d >= 0 control steps; or ``(low, high)``, drawn uniformly at every reset; or a delay process, also as
+        text such as ``"UniformDelay(0, 8)"``
     :param action_delay: control steps from choosing an action to its execution: >= 0; or ``(low, high)`` or a process
         that draws one delay an episode. Time is the actuator's: the action is executed in the true state, and
         observations look older by as much. The task starts when the first action arrives.
@@ -62,8 +63,8 @@ class DelayedObservationWrapper(
     def __init__(
         self,
         env: gym.Env[Any, Any],
-        delay: int | tuple[int, int] | DelayProcess = 4,
-        action_delay: int | tuple[int, int] | DelayProcess = 0,
+        delay: int | tuple[int, int] | str | DelayProcess = 4,
+        action_delay: int | tuple[int, int] | str | DelayProcess = 0,
         *,
         max_delay: int | None = None,
         receiver: str = "newest",
@@ -88,7 +89,9 @@ class DelayedObservationWrapper(
                 f"DelayedObservationWrapper scales actions by their bounds, but low and high are equal in {act_space}; "
                 "leave out the action entries that cannot vary."
             )
-        self.process = make_process(delay) if action_delay == 0 else TotalDelay(delay, action_delay)
+        self.process = (
+            make_process(delay) if action_delay == 0 else TotalDelay(make_process(delay), make_process(action_delay))
+        )
         self.max_delay = self.process.max_delay if max_delay is None else max_delay
         if self.max_delay < self.process.max_delay:
             raise ValueError(f"max_delay={max_delay} is smaller than the largest delay {self.process.max_delay}.")

@@ -161,11 +161,14 @@ class DelayedSAC(SafeSaveMixin, SAC):
 
     @staticmethod
     def _delay_of(env: VecEnv | None) -> str | None:
-        """Write out the delay process of an environment, None without one."""
+        """Write out the delay process of an environment, by its class where it has no repr; None without one."""
         try:
-            return None if env is None else repr(env.get_attr("process")[0])
+            process = None if env is None else env.get_attr("process")[0]
         except AttributeError:
             return None
+        if process is None:
+            return None
+        return type(process).__name__ if type(process).__repr__ is object.__repr__ else repr(process)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Update critics, actor, entropy coefficient and target critics ``gradient_steps`` times, as SAC does."""

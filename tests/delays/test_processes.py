@@ -28,13 +28,16 @@ from sb3_said.delays.processes import make_process, packet_delays
         ((0, 8), EpisodeDelay(0, 8)),
         ([3, 3], EpisodeDelay(3, 3)),  # YAML has no tuples
         (EpisodeDelay(1, 2), EpisodeDelay(1, 2)),
+        ("4", FixedDelay(4)),
+        ("(0, 8)", EpisodeDelay(0, 8)),
+        ("WIFI_20MS", WIFI_20MS),
     ],
 )
 def test_what_a_user_may_write(written, process):
     assert make_process(written) == process
 
 
-@pytest.mark.parametrize("written", [-1, (-1, 2), (4, 2), 1.5, (0, 2.5), (1, 2, 3), True, (False, True), None, "4"])
+@pytest.mark.parametrize("written", [-1, (-1, 2), (4, 2), 1.5, (0, 2.5), (1, 2, 3), True, (False, True), None, "4.5"])
 def test_what_is_refused(written):
     with pytest.raises(ValueError, match=r"delay"):
         make_process(written)

@@ -117,7 +117,7 @@ def test_the_paper_preset_is_the_papers_table(env_id: str, delay: int) -> None:
         "Hopper-v5": [(8, 0.6), (4, 0.3), (2, 0.1), (8, 0.6)],
         "Walker2d-v5": [(8, 0.8), (8, 0.6), (4, 0.8), (8, 0.6)],
     }
-    settings = zoo.preset_overrides(zoo.config_file("said"), "paper", env_id, [delay])
+    settings = zoo.preset_overrides(zoo.config_file("said"), "paper", env_id, delay)
     depth, temperature = tables[env_id][[0, 4, 8, 16].index(delay)]
     assert settings["n_timesteps"] == 5e6 and settings["planner_gradient_steps"] == 1_000_000
     config = PlannerConfig(**settings["planner_kwargs"])
@@ -127,19 +127,59 @@ def test_the_paper_preset_is_the_papers_table(env_id: str, delay: int) -> None:
 @pytest.mark.parametrize("preset", zoo.PRESETS)
 @pytest.mark.parametrize("algo", zoo.ALGORITHMS)
 def test_every_preset_exists_for_every_algorithm(algo: str, preset: str) -> None:
-    assert isinstance(zoo.preset_overrides(zoo.config_file(algo), preset, "Hopper-v5", [4]), dict)
+    assert isinstance(zoo.preset_overrides(zoo.config_file(algo), preset, "Hopper-v5", 4), dict)
 
 
 def test_an_unknown_preset_is_named() -> None:
     with pytest.raises(ValueError, match="no preset 'fast'"):
-        zoo.preset_overrides(zoo.config_file("said"), "fast", "Hopper-v5", [4])
+        zoo.preset_overrides(zoo.config_file("said"), "fast", "Hopper-v5", 4)
 
 
-@pytest.mark.parametrize("delay", (["-1"], ["1", "2", "3"]))
-def test_a_bad_delay_is_refused(delay: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("words", "delay"),
+    [
+        ([], None),
+        (["4"], 4),
+        (["0", "8"], [0, 8]),
+        (["WIFI_20MS"], "WIFI_20MS"),
+        (["DroppedPackets(4, p=0.1)"], "DroppedPackets(4, p=0.1)"),
+    ],
+)
+def test_what_delay_takes(words: list[str], delay: zoo.Delay) -> None:
+    assert zoo.read_delay(words) == delay
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["-1"], "whole number of control steps >= 0"),
+        (["1", "2", "3"], "--delay takes N, or LOW HIGH"),
+        (["UniformDelay(0,", "8)"], "--delay takes N, or LOW HIGH"),
+        (["4", "WIFI_20MS"], "--delay takes N, or LOW HIGH"),
+        (["print(1)"], "expected numbers, WIFI_20MS, FixedDelay"),
+    ],
+)
+def test_a_bad_delay_is_refused(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        train.main(["--env", "Pendulum-v1", "--delay", *delay])
-    assert "--delay takes" in capsys.readouterr().err
+        train.main(["--env", "Pendulum-v1", "--delay", *words])
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("delay", "name"),
+    [(None, ""), (4, "-delay4"), ([0, 8], "-delay0-8"), ("UniformDelay(0, 8)", "-delayUniformDelay-0-8")],
+)
+def test_the_log_path_names_the_delay(delay: zoo.Delay, name: str) -> None:
+    assert zoo.Run([], delay, "smoke", 1).delay_name == name
+
+
+def test_the_papers_settings_go_by_the_largest_delay() -> None:
+    def depth(delay: zoo.Delay) -> int:
+        return int(
+            zoo.preset_overrides(zoo.config_file("said"), "paper", "Hopper-v5", delay)["planner_kwargs"]["depth"]
+        )
+
+    assert [depth(delay) for delay in (4, [0, 8], "UniformDelay(0, 8)", 5)] == [4, 2, 2, 8]
 
 
 def test_resuming_a_folder_without_a_run_says_so(tmp_path: Path) -> None:

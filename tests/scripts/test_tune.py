@@ -30,7 +30,7 @@ from optuna.trial import TrialState
 from runs import load_run
 from study import MainEffects, Search, returns_of
 from winner import RunConfig
-from zoo import DelayedExperimentManager, Run
+from zoo import Delay, DelayedExperimentManager, Run, read_delay
 
 from sb3_said import SAID
 from sb3_said.common.checkpoint import CHECKPOINT_NAME
@@ -61,7 +61,7 @@ def train_said(folder: Path, *params: str, delay: Sequence[int] = (2,)) -> Path:
     return train_run(folder, "said", *planner, *params, delay=delay)
 
 
-def read_by_train(best: Path, delay: list[int], preset: str, folder: Path) -> dict[str, Any]:
+def read_by_train(best: Path, delay: Delay, preset: str, folder: Path) -> dict[str, Any]:
     """Return the hyper-parameters that train.py gets from a best.yml."""
     run = Run([], delay, preset, 25_000)
     manager = DelayedExperimentManager(run, Namespace(), "said", ENV, str(folder), config=str(best), verbose=0)
@@ -183,7 +183,7 @@ def test_a_search_with_a_drawn_delay_or_vec_normalize(delay: list[int], params: 
         assert one["returns"] == played.returns.tolist()
     expected = {**config_of(run), "n_timesteps": 200}
     expected["planner_kwargs"] |= {name: results["winner"][name] for name in ("depth", "temperature")}
-    assert read_by_train(run / "tune" / "best.yml", delay, "cpu", tmp_path) == expected
+    assert read_by_train(run / "tune" / "best.yml", read_delay([str(d) for d in delay]), "cpu", tmp_path) == expected
     command = RunConfig.read(run).train_command(run / "tune")
     assert f"--delay {' '.join(map(str, delay))} -conf" in command
 
@@ -196,7 +196,7 @@ def test_train_reads_the_winner(run: Path, tmp_path: Path) -> None:
     expected = {**config_of(run), "n_timesteps": 200}
     expected["planner_kwargs"] |= {"depth": 2, "temperature": 0.3}
     for preset in ("cpu", "paper"):  # "paper" is the default on a machine with a GPU
-        assert read_by_train(best, [2], preset, tmp_path) == expected
+        assert read_by_train(best, 2, preset, tmp_path) == expected
     assert config.train_command(run / "tune").endswith(f"--env {ENV} --delay 2 -conf {best}")
     train.main(["--algo", "said", "--env", ENV, "--delay", "2", "-conf", str(best), "-f", str(tmp_path), "-n", "120",
                 "--num-threads", "1", "--eval-freq", "-1", "--device", "cpu", "--verbose", "0"])  # fmt: skip

@@ -1,0 +1,60 @@
+"""Delays written as text."""
+
+import gymnasium as gym
+import pytest
+from hypothesis import given, settings
+from random_processes import processes
+
+from sb3_said.delays import (
+    WIFI_20MS,
+    DelayedObservationWrapper,
+    DroppedPackets,
+    FixedDelay,
+    HeldDelay,
+    TotalDelay,
+    UniformDelay,
+)
+from sb3_said.delays.written import parse_process
+
+
+@settings(deadline=None)
+@given(processes())
+def test_what_a_process_prints_reads_back(process):
+    assert parse_process(repr(process)) == process
+
+
+def test_processes_of_processes():
+    assert parse_process(" DroppedPackets(UniformDelay(0, high=8), p=1e-1) ") == DroppedPackets(
+        UniformDelay(0, 8), p=0.1
+    )
+    held = parse_process("HeldDelay(TotalDelay(WIFI_20MS, (0, 2)), hold_prob=0.5)")
+    assert held == HeldDelay(TotalDelay(WIFI_20MS, (0, 2)), hold_prob=0.5)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is no delay"),
+        ("UniformDelay(0,", "is no delay"),
+        ("UniformDelay()", "missing 2 required positional arguments"),
+        ("UniformDelay(0, 8, speed=2)", "unexpected keyword argument 'speed'"),
+        ("UniformDelay(8, 0)", "0 <= low <= high"),
+        ("DroppedPackets(4, p=True)", "'True' is no delay"),
+        ("wifi", "expected numbers, WIFI_20MS, FixedDelay"),
+        ("__import__('os').getcwd()", "is no delay"),
+        ("UniformDelay(0, ().__class__)", "is no delay"),
+        ("UniformDelay(*(0, 8))", "is no delay"),
+        ("UniformDelay(**{'low': 0, 'high': 8})", "is no delay"),
+        ("[x for x in (1, 2)]", "is no delay"),
+        ("'4'", "is no delay"),
+    ],
+)
+def test_anything_else_is_refused_and_not_run(text, message):
+    with pytest.raises(ValueError, match=message.replace("(", r"\(")):
+        parse_process(text)
+
+
+def test_the_wrapper_takes_text():
+    env = DelayedObservationWrapper(gym.make("Pendulum-v1"), "DroppedPackets(2, p=0.1)", "1")
+    assert env.process == TotalDelay(DroppedPackets(2, p=0.1), FixedDelay(1))
+    assert env.observation_space["action_history"].shape == (7, 1)
