@@ -25,6 +25,7 @@ examples:
   python scripts/train.py --algo said --env Ant-v5 --delay 8 --preset paper --seed 1
   python scripts/train.py --algo sadr --env HalfCheetah-v5 --delay 0 8 -n 300000 -P
   python scripts/train.py --algo said --env Hopper-v5 --delay "DroppedPackets(UniformDelay(0, 8), p=0.1)"
+  python scripts/train.py --algo said --env Hopper-v5 --delay 0 16 --expert-delay 0
   python scripts/train.py --resume logs/said/Hopper-v5-delay4_1
 
 Runs go to LOG_FOLDER/ALGO/ENV-delayN_K (-f sets LOG_FOLDER); scripts/evaluate.py and scripts/enjoy.py take that folder.
@@ -40,6 +41,9 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("-h", "--help", action="store_true", help="show this help, then that of rl_zoo3")
     parser.add_argument("--algo", choices=list(ALGORITHMS), default="said", help="default: said")
     add_delay(parser, default="no delay")
+    add_delay(
+        parser, "that of --delay", "--expert-delay", "delay that SAID's expert learns under; the planner serves --delay"
+    )
     parser.add_argument(
         "--preset",
         choices=PRESETS,
@@ -67,10 +71,12 @@ def main(argv: list[str]) -> None:
         resume, (options, zoo_argv) = options.resume, parser().parse_known_args(argv)
         options.resume = resume
     try:
-        delay = read_delay(options.delay)
+        delay, expert_delay = read_delay(options.delay), read_delay(options.expert_delay)
     except ValueError as error:
         parser().error(str(error))
-    run = Run(argv, delay, options.preset, options.checkpoint_freq, options.resume)
+    if expert_delay is not None and (options.algo != "said" or delay is None):
+        parser().error("--expert-delay is for --algo said with a --delay: who has no planner acts as it has learned")
+    run = Run(argv, delay, options.preset, options.checkpoint_freq, options.resume, expert_delay)
     rl_zoo3.train.ExperimentManager = functools.partial(DelayedExperimentManager, run)  # type: ignore[misc,assignment]
     sys.argv = [sys.argv[0], "--algo", options.algo, *zoo_argv, *(["--help"] if options.help else [])]
     rl_zoo3.train.train()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import re
 import sys
@@ -19,8 +20,9 @@ from rl_zoo3.utils import get_latest_run_id
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import Logger, make_output_format
+from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_said import SAID, DelayedSAC, PlannerTrainingCallback
+from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC, PlannerTrainingCallback
 from sb3_said.common.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback, restore_training
 from sb3_said.delays.processes import make_process
 
@@ -57,19 +59,18 @@ def default_preset() -> str:
     return "paper" if th.cuda.is_available() else "cpu"
 
 
-def add_delay(parser: argparse.ArgumentParser, default: str) -> None:
-    """Give a command line the option ``--delay``, to be read by ``read_delay``.
+DELAY_HELP = (
+    "age of observations in control steps; LOW HIGH: drawn anew each episode; or a process of docs/delays.md, such as "
+    "'DroppedPackets(4, p=0.1)'"
+)
+
+
+def add_delay(parser: argparse.ArgumentParser, default: str, name: str = "--delay", help: str = DELAY_HELP) -> None:
+    """Give a command line an option of a delay, to be read by ``read_delay``.
 
     :param default: what leaving it out means
     """
-    parser.add_argument(
-        "--delay",
-        nargs="+",
-        default=[],
-        metavar="STEPS",
-        help="age of observations in control steps; LOW HIGH: drawn anew each episode; or a process of docs/delays.md, "
-        f"such as 'DroppedPackets(4, p=0.1)' (default: {default})",
-    )
+    parser.add_argument(name, nargs="+", default=[], metavar="STEPS", help=f"{help} (default: {default})")
 
 
 def read_delay(words: list[str]) -> Delay:
@@ -116,6 +117,7 @@ class Run:
     :param preset: see ``preset_overrides``
     :param checkpoint_freq: environment steps between checkpoints
     :param resume: folder of the run to continue
+    :param expert_delay: what the expert learns under, ``delay`` by default; the planner serves ``delay`` in any case
     """
 
     argv: list[str]
@@ -123,12 +125,19 @@ class Run:
     preset: str
     checkpoint_freq: int
     resume: Path | None = None
+    expert_delay: Delay = None
 
     @property
     def delay_name(self) -> str:
-        """Name of the delay in paths, e.g. ``-delay4``, ``-delay0-8`` or ``-delayUniformDelay-0-8``."""
-        words = re.findall(r"[\w.]+", str(self.delay))
-        return "" if self.delay is None else f"-delay{'-'.join(words)}"
+        """Name of the delays in paths, e.g. ``-delay4``, ``-delayUniformDelay-0-8`` or ``-delay0-8-expert0``."""
+        parts = [("delay", self.delay), ("expert", self.expert_delay)]
+        words = {name: "-".join(re.findall(r"[\w.]+", str(delay))) for name, delay in parts if delay is not None}
+        return "".join(f"-{name}{text}" for name, text in words.items())
+
+    @property
+    def max_delay(self) -> int:
+        """Largest delay that planner or expert will meet."""
+        return max((make_process(x).max_delay for x in (self.delay, self.expert_delay) if x is not None), default=0)
 
 
 class DelayedExperimentManager(ExperimentManager):
@@ -152,7 +161,10 @@ class DelayedExperimentManager(ExperimentManager):
         overrides = preset_overrides(self.config, run.preset, env_id, run.delay)
         overrides |= ALGORITHMS[algo][1]
         if run.delay is not None:
-            overrides["env_wrapper"] = [{WRAPPER: {"delay": run.delay}}]
+            largest = {} if run.expert_delay is None else {"max_delay": run.max_delay}
+            overrides["env_wrapper"] = [{WRAPPER: {"delay": run.delay, **largest}}]
+        if run.expert_delay is not None and "env_wrapper" in (self.custom_hyperparams or {}):
+            raise ValueError("--expert-delay sets the wrapper itself; leave env_wrapper out of -params.")
         self.custom_hyperparams = {**overrides, **(self.custom_hyperparams or {})}
         planner_kwargs = self.custom_hyperparams.get("planner_kwargs")
         varies = run.delay is not None and not isinstance(run.delay, int)
@@ -161,6 +173,16 @@ class DelayedExperimentManager(ExperimentManager):
                 f"A planner with mask='fixed' serves one delay, got --delay {run.delay}; "
                 "use mask='random' (another --preset, or -params planner_kwargs:\"dict(mask='random')\")."
             )
+
+    def create_envs(self, *args: Any, **kwargs: Any) -> VecEnv:
+        """Make environments of the expert's delay, in training as in the evaluations beside it.
+
+        The run's settings on disk keep the delay that the agent is for.
+        """
+        if self.run.expert_delay is not None:
+            process = make_process(self.run.expert_delay)
+            self.env_wrapper = functools.partial(DelayedObservationWrapper, delay=process, max_delay=self.run.max_delay)
+        return super().create_envs(*args, **kwargs)
 
     @property
     def checkpoint(self) -> Path:

@@ -11,7 +11,10 @@ from sb3_said.common.registry import register_class
 
 @register_class
 class StateAugmentedExtractor(BaseFeaturesExtractor):
-    """Concatenate [delayed observation, action history, age / D], which make the process Markov (paper, Theorem 2.1).
+    """Concatenate [delayed observation, actions sent since, age / D], which make the process Markov (Theorem 2.1).
+
+    Actions older than the observation are shown as zeros: it holds all that they did, and one actor for many ages would
+    have to learn to look away.
 
     :param observation_space: that of ``DelayedObservationWrapper``
     """
@@ -20,11 +23,13 @@ class StateAugmentedExtractor(BaseFeaturesExtractor):
         history = observation_space["action_history"]
         obs_dim, (max_delay, act_dim) = observation_space["observation"].shape[0], history.shape  # type: ignore
         super().__init__(observation_space, features_dim=obs_dim + max_delay * act_dim + 1)
-        self.age_scale = 1.0 / max(max_delay, 1)
+        self.max_delay = max_delay
 
     def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
-        history = observations["action_history"].flatten(1)  # (B, D * act_dim)
-        return th.cat([observations["observation"], history, observations["delay"] * self.age_scale], dim=1)
+        age = observations["delay"]  # (B, 1)
+        since = th.arange(self.max_delay, 0, -1, device=age.device) <= age  # (B, D): a_{t-k} came after s_{t-age}
+        history = observations["action_history"] * since[..., None]  # (B, D, act_dim)
+        return th.cat([observations["observation"], history.flatten(1), age / max(self.max_delay, 1)], dim=1)
 
 
 @register_class

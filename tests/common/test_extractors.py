@@ -38,6 +38,17 @@ def test_age_is_a_fraction_of_the_largest():
     assert features[:, -1].tolist() == [0.0, 0.25, 1.0]
 
 
+def test_actions_older_than_the_observation_are_not_shown():
+    extractor = StateAugmentedExtractor(make_space(4))
+    history = th.rand(5, 4, 2) + 0.1
+    ages = th.arange(5.0)[:, None]
+    features = extractor({"observation": th.zeros(5, 3), "action_history": history, "delay": ages})
+    shown = features[:, 3:-1].unflatten(1, (4, 2))
+    for age in range(5):
+        assert th.equal(shown[age, 4 - age :], history[age, 4 - age :])
+        assert not shown[age, : 4 - age].any()
+
+
 def test_key():
     extractor = KeyExtractor(make_space(2), "observation")
     observation = th.rand(5, 3)

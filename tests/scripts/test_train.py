@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import train
 import zoo
+from runs import load_run
 
 from sb3_said import SAID, PlannerConfig
 from sb3_said.common.save_util import load_tree
@@ -171,6 +172,26 @@ def test_a_bad_delay_is_refused(words: list[str], message: str, capsys: pytest.C
 )
 def test_the_log_path_names_the_delay(delay: zoo.Delay, name: str) -> None:
     assert zoo.Run([], delay, "smoke", 1).delay_name == name
+
+
+def test_the_expert_can_learn_under_another_delay(tmp_path: Path) -> None:
+    command = "--algo said --env Pendulum-v1 --delay 0 3 --expert-delay 0 --preset smoke -n 700 --eval-freq -1"
+    train.main([*command.split(), "--num-threads", "1", "-f", str(tmp_path), "--verbose", "0"])
+    run = tmp_path / "said" / "Pendulum-v1-delay0-3-expert0_1"
+    played = load_run(run, device="cpu")
+    assert played.info["delay"] == "EpisodeDelay(low=0, high=3)"
+    model = played.model
+    assert (model.trained_delay, model.policy.max_delay) == ("FixedDelay(delay=0)", 3)
+    assert model.policy.planner_is_trained
+
+
+@pytest.mark.parametrize("words", (["--algo", "sadr", "--delay", "4"], ["--algo", "said"]))
+def test_only_a_planner_serves_another_delay_than_its_expert(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        train.main(["--env", "Pendulum-v1", *words, "--expert-delay", "0"])
+    assert "--expert-delay is for --algo said" in capsys.readouterr().err
 
 
 def test_the_papers_settings_go_by_the_largest_delay() -> None:
