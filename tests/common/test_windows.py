@@ -92,7 +92,7 @@ def critic(states, actions):
 def test_every_window_is_a_piece_of_one_episode(
     n_envs, delay, max_length, interruption, n_steps, steps_per_env, length, newest_fraction, value_fn, seed
 ):
-    player = Player(n_envs, delay, 3, max_length, interruption, seed)
+    player = Player(n_envs, delay, 3, max_length=max_length, interruption=interruption, seed=seed)
     rows = player.play(n_steps)
     source = make_buffer(player, steps_per_env, rows).window_source(newest_fraction, value_fn=value_fn)
     n_rows = max(int(min(n_steps, steps_per_env) * newest_fraction), 1)
