@@ -78,8 +78,8 @@ def main(argv: list[str] | None = None) -> None:
     models = {
         "SB3's SAC": make(SAC, None, args),
         "DelayedSAC, float32": make(DelayedSAC, None, args, precision="float32"),
-        "DelayedSAC, auto": make(DelayedSAC, None, args),
-        f"DelayedSAC at delay {args.delay}, auto": make(DelayedSAC, args.delay, args),
+        "DelayedSAC, auto": make(DelayedSAC, None, args, precision="auto"),
+        f"DelayedSAC at delay {args.delay}, auto": make(DelayedSAC, args.delay, args, precision="auto"),
     }
     seconds = turn_by_turn(
         {name: lambda m=m: m.train(UPDATES_PER_TURN, args.batch_size) for name, m in models.items()},

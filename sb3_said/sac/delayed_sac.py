@@ -46,8 +46,9 @@ class DelayedSAC(SafeSaveMixin, SAC):
     :param learning_rate: of actor, critics and entropy coefficient; a number or a schedule
     :param augment_state: the actor reads [observation, action history, age]
     :param delay_reconciled_critic: the critics read the true state
-    :param precision: of the matrix products in updates: ``"float32"``, ``"bfloat16"``, or ``"auto"``, the latter where
-        the hardware has it; weights, losses, acting and gSDE (``use_sde``) are float32 in any case
+    :param precision: of the matrix products in updates: ``"float32"``; ``"bfloat16"``, faster, but its learning curves
+        lie below so far (results/README.md); or ``"auto"``, bfloat16 where the hardware has it. Weights, losses, acting
+        and gSDE (``use_sde``) are float32 in any case
     :param sac_kwargs: every other argument of :class:`stable_baselines3.SAC`
     :raises ValueError: for spaces that are neither, a ``VecNormalize`` of more than the observation, or options that
         need another replay buffer (``n_steps`` > 1) or policy
@@ -70,7 +71,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
         *,
         augment_state: bool = True,
         delay_reconciled_critic: bool = True,
-        precision: str = "auto",
+        precision: str = "float32",
         **sac_kwargs: Any,
     ):
         if sac_kwargs.get("n_steps", 1) != 1:
