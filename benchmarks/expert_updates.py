@@ -14,13 +14,12 @@ from typing import Any
 
 import gymnasium as gym
 import torch as th
-from measure import matmul_rate, parser, percentiles, print_table, ratio, turn_by_turn, write_json
+from measure import dtype_name, matmul_rates, parser, percentiles, print_table, ratio, turn_by_turn, write_json
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_said import DelayedObservationWrapper, DelayedSAC
-from sb3_said.common.precision import compute_dtype
 
 UPDATES_PER_TURN = 20
 
@@ -55,10 +54,6 @@ def matmul_flops(model: DelayedSAC, batch_size: int) -> int:
     return 2 * batch_size * (actor_passes + critic_passes)
 
 
-def _dtype_name(model: DelayedSAC) -> str:
-    return str(compute_dtype(model.precision, model.device)).removeprefix("torch.")
-
-
 def parse(argv: list[str] | None) -> argparse.Namespace:
     """Read the command line."""
     p = parser(__doc__)
@@ -86,7 +81,7 @@ def main(argv: list[str] | None = None) -> None:
         args.rounds,
         args.device,
     )
-    rates = {dtype: matmul_rate(dtype, args.device) for dtype in ("float32", "bfloat16")}
+    rates = matmul_rates(args.device)
     rows = []
     for name, model in models.items():
         each = seconds[name] / UPDATES_PER_TURN
@@ -94,7 +89,8 @@ def main(argv: list[str] | None = None) -> None:
         row["times SB3's SAC"] = ratio(seconds["SB3's SAC"], seconds[name])
         floor = None
         if isinstance(model, DelayedSAC):
-            floor = matmul_flops(model, args.batch_size) / rates[_dtype_name(model)] / float(each.mean())
+            rate = rates[dtype_name(model.precision, model.device)]
+            floor = matmul_flops(model, args.batch_size) / rate / float(each.mean())
         row["fraction of floor"] = floor
         rows.append(row)
     print_table(rows)

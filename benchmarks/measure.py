@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import torch as th
 
+from sb3_said.common.precision import compute_dtype
 from sb3_said.evaluation import Interval, bootstrap_interval
 
 DTYPES = {"float32": th.float32, "bfloat16": th.bfloat16}
@@ -85,6 +86,17 @@ def matmul_rate(dtype: str, device: str | th.device = "cpu", seconds: float = 1.
         if times.sum() >= seconds:
             return float(2 * n**3 / np.percentile(times, 5))
         rounds *= 2
+
+
+def matmul_rates(device: str | th.device = "cpu") -> dict[str, float]:
+    """Return :func:`matmul_rate` of every number format."""
+    return {dtype: matmul_rate(dtype, device) for dtype in DTYPES}
+
+
+def dtype_name(precision: str, device: str | th.device) -> str:
+    """Return the number format that a ``precision`` of ours stands for on a device, as :func:`matmul_rate` takes it."""
+    dtype = compute_dtype(precision, th.device(device))
+    return next(name for name, other in DTYPES.items() if other == dtype)
 
 
 def percentiles(seconds: np.ndarray) -> dict[str, float]:

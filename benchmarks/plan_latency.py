@@ -26,12 +26,11 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import torch as th
-from measure import matmul_rate, parser, percentiles, print_table, ratio, turn_by_turn, write_json
+from measure import dtype_name, matmul_rate, parser, percentiles, print_table, ratio, turn_by_turn, write_json
 from plain import PlainPlanner
 from stable_baselines3 import SAC
 
 from sb3_said import SAID, DelayedObservationWrapper
-from sb3_said.common.precision import compute_dtype
 
 ENV = "Hopper-v5"
 HIDDEN = 256  # of the critics, two layers each: SB3's default
@@ -114,7 +113,7 @@ def measure_setting(setting: Setting, rounds: int, device: str) -> dict[str, Any
     obs = observe(env, setting.delay)
     spaces = env.observation_space["observation"], env.action_space
     plain = make_plain(setting, device, spaces[1], spaces[0])
-    dtype = str(compute_dtype(model.policy.planner.config.precision, model.device)).removeprefix("torch.")
+    dtype = dtype_name(model.policy.planner.config.precision, model.device)
     rate = matmul_rate(dtype, device)
 
     model.warmup()

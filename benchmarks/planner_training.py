@@ -9,8 +9,7 @@ sizes; ours train the regression yardstick beside. "plain" is benchmarks/plain.p
 optimizer and an average that go parameter by parameter. "times plain" is the median of the ratios turn by turn, with
 its 95 % interval. "floor" is the time of the transformer's matrix products alone, counted from their shapes, at the
 rate that large products of the same number format reach on this machine and thread count (the better of a measurement
-before and one after); "fraction of floor" is that over the median time of an update. Memory that ours let the process
-keep speeds up the plain way too.
+before and one after); "fraction of floor" is that over the median time of an update.
 """
 
 from __future__ import annotations
@@ -20,10 +19,9 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from measure import matmul_rate, parser, percentiles, print_table, ratio, turn_by_turn, write_json
+from measure import dtype_name, matmul_rates, parser, percentiles, print_table, ratio, turn_by_turn, write_json
 from plain import PlainPlanner, WindowDataset, batches
 
-from sb3_said.common.precision import compute_dtype
 from sb3_said.common.windows import WindowSource
 from sb3_said.planner import InpaintingPlanner, PlannerConfig, PlannerTrainer
 
@@ -72,14 +70,9 @@ def make_trainer(depth: int, precision: str, args: argparse.Namespace, source: W
     return PlannerTrainer(planner, source, GRADIENT_STEPS, held_out=0.0)
 
 
-def rates(device: str) -> dict[str, float]:
-    """Measure the FLOP/s of large matrix products by number format."""
-    return {dtype: matmul_rate(dtype, device) for dtype in ("float32", "bfloat16")}
-
-
 def measure(depth: int, args: argparse.Namespace) -> list[dict[str, Any]]:
     """Return the rows of one depth."""
-    before = rates(args.device)
+    before = matmul_rates(args.device)
     source = make_source()
     window = args.delay + args.horizon
     plain = PlainPlanner(OBS_DIM, ACT_DIM, args.delay, window, args.d_model, depth, device=args.device)
@@ -91,15 +84,13 @@ def measure(depth: int, args: argparse.Namespace) -> list[dict[str, Any]]:
         for _ in range(4):  # a GPU records its graph in the fourth
             update()
     seconds = turn_by_turn(variants, args.rounds, args.device)
-    best = {dtype: max(rate, before[dtype]) for dtype, rate in rates(args.device).items()}
+    best = {dtype: max(rate, before[dtype]) for dtype, rate in matmul_rates(args.device).items()}
 
     flops = matmul_flops(args.batch_size, window, args.d_model, depth, args.delay)
     rows = []
     for name, each in seconds.items():
-        dtype = (
-            compute_dtype(trainers[name].config.precision, trainers[name].device) if name in trainers else th.float32
-        )
-        median, floor = float(np.median(each)), flops / best[str(dtype).removeprefix("torch.")]
+        precision = trainers[name].config.precision if name in trainers else "float32"
+        median, floor = float(np.median(each)), flops / best[dtype_name(precision, args.device)]
         rows.append(
             {
                 "updates": name,

@@ -14,11 +14,10 @@ from gymnasium import spaces
 from rl_zoo3.utils import get_saved_hyperparams, get_wrapper_class
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
-from zoo import ALGOS, WRAPPER, Delay
+from zoo import ALGOS, WRAPPER, Delay, largest_delay
 
 from sb3_said import DelayedSAC
 from sb3_said.delays import FixedDelay
-from sb3_said.delays.processes import make_process
 from sb3_said.evaluation.rollout import Observation
 
 
@@ -87,7 +86,7 @@ def load_run(
     delay_process = env.get_wrapper_attr("process") if env.has_wrapper_attr("process") else FixedDelay(0)
     env.close()
     if isinstance(model, DelayedSAC):
-        model.check_delay(repr(delay_process))
+        model.check_delay(delay_process)
     info = {
         "algo": algo,
         "env": env_id,
@@ -154,13 +153,13 @@ def _with_delay(wrappers: list[Any], delay: Delay, model: BaseAlgorithm) -> list
     """Set the delay to play under, keeping the length of the action history that the model reads."""
     space = model.observation_space
     if not isinstance(space, spaces.Dict) or "action_history" not in space.spaces:
-        if delay is not None and make_process(delay).max_delay > 0:
+        if largest_delay(delay) > 0:
             raise ValueError(
                 f"This agent reads {space}, not delayed observations: it cannot play with --delay {delay}."
             )
         return wrappers
     max_delay = space["action_history"].shape[0]  # type: ignore[index]  # a Box has a shape
-    if delay is not None and make_process(delay).max_delay > max_delay:
+    if largest_delay(delay) > max_delay:
         raise ValueError(f"This agent was built for delays 0..{max_delay}, got --delay {delay}.")
     kwargs = {"delay": max_delay if delay is None else delay, "max_delay": max_delay}
     names = [next(iter(w)) if isinstance(w, dict) else w for w in wrappers]

@@ -88,6 +88,11 @@ def read_delay(words: list[str]) -> Delay:
     return delay
 
 
+def largest_delay(delay: Delay) -> int:
+    """Return the largest age that a delay can bring, 0 without one."""
+    return 0 if delay is None else make_process(delay).max_delay
+
+
 def preset_overrides(config: str | Path, preset: str, env_id: str, delay: Delay) -> dict[str, Any]:
     """Return what a preset changes for a task: its own entry of ``presets:`` in the file, or the preset's default.
 
@@ -102,7 +107,7 @@ def preset_overrides(config: str | Path, preset: str, env_id: str, delay: Delay)
     if preset not in presets:
         raise ValueError(f"{config} has no preset '{preset}', only {['cpu', *presets]}.")
     overrides = dict(presets[preset].get(env_id, presets[preset]["default"]))
-    tuned = overrides.pop("planner_by_delay", {}).get(0 if delay is None else make_process(delay).max_delay)
+    tuned = overrides.pop("planner_by_delay", {}).get(largest_delay(delay))
     if tuned is not None:
         overrides["planner_kwargs"] = {**overrides["planner_kwargs"], "depth": tuned[0], "temperature": tuned[1]}
     return overrides
@@ -137,7 +142,7 @@ class Run:
     @property
     def max_delay(self) -> int:
         """Largest delay that planner or expert will meet."""
-        return max((make_process(x).max_delay for x in (self.delay, self.expert_delay) if x is not None), default=0)
+        return max(largest_delay(self.delay), largest_delay(self.expert_delay))
 
 
 class DelayedExperimentManager(ExperimentManager):

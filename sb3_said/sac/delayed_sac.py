@@ -20,6 +20,7 @@ from sb3_said.common.buffers import DelayedReplayBuffer
 from sb3_said.common.checks import check_choice
 from sb3_said.common.precision import PRECISIONS, autocast
 from sb3_said.common.save_util import PickleRefusedError, SafeSaveMixin, explained_refusal, load_tree, save_tree
+from sb3_said.delays.processes import DelayProcess
 from sb3_said.sac.networks import FusedAdam, StackedCritic
 from sb3_said.sac.policies import DelayedSACPolicy
 
@@ -46,9 +47,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
     :param learning_rate: of actor, critics and entropy coefficient; a number or a schedule
     :param augment_state: the actor reads [observation, action history, age]
     :param delay_reconciled_critic: the critics read the true state
-    :param precision: of the matrix products in updates: ``"float32"``; ``"bfloat16"``, faster, but its learning curves
-        lie below so far (results/README.md); or ``"auto"``, bfloat16 where the hardware has it. Weights, losses, acting
-        and gSDE (``use_sde``) are float32 in any case
+    :param precision: of the matrix products between hidden layers in updates: ``"float32"``; ``"bfloat16"``, which is
+        faster; or ``"auto"``, bfloat16 where the hardware has it. All else, acting and gSDE (``use_sde``) are float32
     :param sac_kwargs: every other argument of :class:`stable_baselines3.SAC`
     :raises ValueError: for spaces that are neither, a ``VecNormalize`` of more than the observation, or options that
         need another replay buffer (``n_steps`` > 1) or policy
@@ -129,25 +129,26 @@ class DelayedSAC(SafeSaveMixin, SAC):
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         learn = super()._setup_learn(*args, **kwargs)
-        self.trained_delay = self._delay_of(self.env)
+        self.trained_delay = _written(_process_of(self.env))
         return learn
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Take another environment, as SB3 does; see :meth:`check_delay` for one with another delay."""
         super().set_env(env, force_reset)
-        self.check_delay(self._delay_of(self.env))
+        self.check_delay(_process_of(self.env))
 
     def _check_loaded(self) -> None:
         if self.env is not None:
-            self.check_delay(self._delay_of(self.env))
+            self.check_delay(_process_of(self.env))
 
-    def check_delay(self, delay: str | None) -> None:
+    def check_delay(self, process: DelayProcess | None) -> None:
         """Warn where an agent that was trained under one delay is to act under another.
 
         Ages it has never acted on are not an error, since training can go on with them, but nothing was learned there.
 
-        :param delay: the delay process that it will meet, written out (its ``repr``); None where nothing is delayed
+        :param process: makes the delays that it will meet; None where nothing is delayed
         """
+        delay = _written(process)
         if self.trained_delay is None or delay == self.trained_delay or self._serves_every_delay():
             return
         warnings.warn(
@@ -159,17 +160,6 @@ class DelayedSAC(SafeSaveMixin, SAC):
     def _serves_every_delay(self) -> bool:
         """Tell whether answers are as good at ages that training did not bring."""
         return False
-
-    @staticmethod
-    def _delay_of(env: VecEnv | None) -> str | None:
-        """Write out the delay process of an environment, by its class where it has no repr; None without one."""
-        try:
-            process = None if env is None else env.get_attr("process")[0]
-        except AttributeError:
-            return None
-        if process is None:
-            return None
-        return type(process).__name__ if type(process).__repr__ is object.__repr__ else repr(process)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Update critics, actor, entropy coefficient and target critics ``gradient_steps`` times, as SAC does."""
@@ -270,3 +260,17 @@ class DelayedSAC(SafeSaveMixin, SAC):
             super().load_replay_buffer(path, truncate_last_traj)
             return
         self.replay_buffer.load_state_dict(state)
+
+
+def _process_of(env: VecEnv | None) -> DelayProcess | None:
+    try:
+        return None if env is None else env.get_attr("process")[0]
+    except AttributeError:
+        return None
+
+
+def _written(process: DelayProcess | None) -> str | None:
+    """Write out a delay process, by its class where it has no repr of its own."""
+    if process is None:
+        return None
+    return type(process).__name__ if type(process).__repr__ is object.__repr__ else repr(process)

@@ -200,11 +200,30 @@ def test_another_delay_than_it_learned_under_is_never_taken_silently(tmp_path):
         model.set_env(delayed(3))
 
 
+class OwnDelay:
+    """A user's own process, without a repr."""
+
+    max_delay = 2
+
+    def sample(self, rng):
+        return int(rng.integers(3))
+
+
+def test_own_delays_are_told_apart_by_their_class():
+    model = make(delayed(OwnDelay())).learn(30)
+    assert model.trained_delay == "OwnDelay"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.check_delay(OwnDelay())
+    with pytest.warns(UserWarning, match=r"learned under OwnDelay and is given None"):
+        model.check_delay(None)
+
+
 def test_precision_is_what_was_asked_for():
     """bfloat16 keeps 8 bits: an update's losses differ from float32's by less than 2 %, and not by nothing."""
 
     def losses(precision):
-        model = make(precision=precision, learning_starts=60, batch_size=64)
+        model = make(precision=precision, learning_starts=60, batch_size=64, policy_kwargs={"net_arch": [16, 16]})
         model.set_logger(Logger(None, []))
         model.learn(62, log_interval=None)
         assert {p.dtype for p in model.policy.parameters()} == {th.float32}
