@@ -1,6 +1,7 @@
 """Stacked networks against the layers they were made of, and their gradients against autograd's."""
 
 import copy
+import itertools
 
 import pytest
 import torch as th
@@ -125,13 +126,14 @@ def test_weights_that_do_not_fit_are_named():
         critic.load_state_dict(critic.state_dict() | {"qf2.0.weight": th.zeros(1)})
 
 
-def layers(n_in, n_hidden, n_out):
-    return [((f"{i}", nn.Linear(*sizes)),) for i, sizes in enumerate([(n_in, n_hidden), (n_hidden, n_out)])]
+def layers(*sizes):
+    return [((f"{i}", nn.Linear(*pair)),) for i, pair in enumerate(itertools.pairwise(sizes))]
 
 
-def test_bfloat16_rounds_and_no_more():
+@pytest.mark.parametrize("activation", [nn.ReLU, nn.Tanh])
+def test_bfloat16_rounds_and_no_more(activation):
     """Eight bits of mantissa: outputs and gradients within 3 % of their size, over both networks."""
-    net = StackedMLP([layers(6, 64, 3), layers(6, 64, 3)], nn.ReLU)
+    net = StackedMLP([layers(6, 64, 64, 3), layers(6, 64, 64, 3)], activation)
     x = th.randn(128, 6)
     found = []
     for enabled in (False, True):
@@ -148,8 +150,24 @@ def test_bfloat16_rounds_and_no_more():
         assert 1e-4 < error < 0.03
 
 
+@pytest.mark.parametrize("activation", [nn.ReLU, nn.Tanh])
+def test_bfloat16_keeps_small_differences_of_large_inputs_and_outputs(activation):
+    """A value near 200 is known to far less than 1, an observation near 10 to far less than 0.06."""
+    net = StackedMLP([layers(6, 64, 64, 1)], activation)
+    with th.no_grad():
+        dict(net.named_views(net.flat))["2.bias"].fill_(200.0)
+        dict(net.named_views(net.flat))["0.bias"].sub_(dict(net.named_views(net.flat))["0.weight"].sum(1) * 10)
+    x = 10 + 0.03 * th.randn(512, 6)
+    exact = net(x)
+    with th.autocast("cpu", th.bfloat16):
+        rounded = net(x)
+    assert (rounded - exact).abs().max() < 0.01
+    found, expected = rounded - rounded.mean(), exact - exact.mean()
+    assert th.corrcoef(th.stack([found.flatten(), expected.flatten()]))[0, 1] > 0.99
+
+
 def test_bfloat16_follows_every_change_of_the_weights():
-    net = StackedMLP([layers(6, 8, 1)], nn.ReLU)
+    net = StackedMLP([layers(6, 8, 8, 1)], nn.ReLU)
     x = th.randn(4, 6)
 
     def outputs():
