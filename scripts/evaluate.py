@@ -4,18 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import platform
-import shlex
-import sys
-from datetime import datetime, timezone
 from functools import partial
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import torch as th
-from runs import LoadedRun, answering, answers, load_run
+from runs import LoadedRun, answering, answers, load_run, origin
 from tqdm import tqdm
 from zoo import add_delay, read_delay
 
@@ -133,27 +127,6 @@ def print_table(summaries: list[Summary]) -> None:
         interval = f"[{s.mean_return.low:,.1f}, {s.mean_return.high:,.1f}]"
         speed = "not measured" if s.latency is None else str(s.latency)
         print(f"{s.label:10} {s.mean_return.value:12,.1f} {interval:>24} {s.mean_length.value:8,.1f}   {speed}")
-
-
-def origin(run: LoadedRun) -> dict[str, Any]:
-    """Say what a reader needs to judge and repeat the numbers: command, date, machine, versions."""
-    packages = ("sb3_said", "stable_baselines3", "torch", "gymnasium", "mujoco", "numpy")
-    return {
-        "command": shlex.join(["python", *sys.argv]),
-        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} CPU cores",
-        "device": str(run.model.device),
-        "torch_threads": th.get_num_threads(),
-        "versions": {"python": platform.python_version(), **{package: version_of(package) for package in packages}},
-    }
-
-
-def version_of(package: str) -> str:
-    """Return the installed version; a clone can run without being installed."""
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "not installed"
 
 
 def draw(path: Path, summaries: list[Summary], folder: Path) -> None:

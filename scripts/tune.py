@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import torch as th
-from evaluate import evaluate, origin
+from evaluate import evaluate
 from optuna.trial import FrozenTrial
-from runs import LoadedRun, load_run
+from runs import LoadedRun, load_run, origin
 from study import Search, returns_of, save_plots
 from winner import RunConfig, write_text
 

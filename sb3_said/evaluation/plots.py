@@ -5,19 +5,23 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Sequence
+import textwrap
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from sb3_said.evaluation.statistics import Summary, bootstrap_interval
+from sb3_said.evaluation.statistics import Interval, Summary, bootstrap_interval
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 # Okabe and Ito's palette: told apart by colour-blind readers too.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+
+# One more than colours, so that many agents differ in one or the other.
+MARKERS = "osD^vPX"
 
 # Column of progress.csv that counts the planner's updates.
 UPDATES = "planner/n_updates"
@@ -115,6 +119,32 @@ def plot_returns(summaries: Sequence[Summary], ax: Axes | None = None) -> Axes:
     return ax
 
 
+def plot_over_delays(table: Mapping[str, Mapping[int | str, Summary]]) -> list[Axes]:
+    """Plot mean returns with their intervals: a line over fixed delays, and points for each random delay.
+
+    :param table: for each agent its summaries, by the delay in control steps or, for a random one, by its name; what an
+        agent lacks is left out
+    :return: a panel for each kind of delay there is, on one figure, with the same axis of returns
+    :raises ValueError: for a table without a summary
+    """
+    names = list(dict.fromkeys(delay for row in table.values() for delay in row))
+    randoms = [name for name in names if isinstance(name, str)]
+    kinds = [_plot_fixed_delays] * (len(randoms) < len(names)) + [_plot_random_delays] * bool(randoms)
+    if not kinds:
+        raise ValueError(f"Nothing was played, got {table}; give each agent a summary for some delay.")
+    legend_rows = math.ceil(len(table) / len(kinds))
+    axes = panels(len(kinds), width=max(5.0, 1.3 * len(randoms)), height=3.4 + 0.2 * legend_rows)
+    for ax, plot in zip(axes, kinds, strict=True):
+        plot(table, ax)
+        ax.sharey(axes[0])
+    axes[0].set_ylabel("return of an episode (undiscounted)")
+    figure = axes[0].get_figure(root=True)
+    assert figure is not None  # for mypy: axes of `panels` have one
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(kinds), frameon=False)
+    return axes
+
+
 def plot_planner_errors(run: str | Path, kind: Literal["present", "action"], ax: Axes | None = None) -> Axes:
     """Plot how far the planner is off on held-out windows, beside an MLP regression trained on the same windows.
 
@@ -157,6 +187,49 @@ def plot_planner_errors(run: str | Path, kind: Literal["present", "action"], ax:
     ax.set_ylim(0, 1.6 * ax.get_ylim()[1])  # room for a legend that no curve runs through
     ax.legend(frameon=False, fontsize="small", ncols=2 if len(columns) > 6 else 1, loc="upper center")
     return ax
+
+
+def _plot_fixed_delays(table: Mapping[str, Mapping[int | str, Summary]], ax: Axes) -> None:
+    delays = sorted({delay for row in table.values() for delay in row if isinstance(delay, int)})
+    for i, (agent, row) in enumerate(table.items()):
+        played = [delay for delay in delays if delay in row]
+        means = [row[delay].mean_return for delay in played]
+        _plot_intervals(ax, i, agent, played, means, linestyle="-")
+        ax.fill_between(
+            played, [m.low for m in means], [m.high for m in means],
+            color=COLORS[i % len(COLORS)], alpha=0.15, linewidth=0,
+        )  # fmt: skip
+    ax.set_xticks(delays)
+    ax.set_xlabel("delay (control steps)")
+
+
+def _plot_random_delays(table: Mapping[str, Mapping[int | str, Summary]], ax: Axes) -> None:
+    names = list(dict.fromkeys(delay for row in table.values() for delay in row if isinstance(delay, str)))
+    for i, (agent, row) in enumerate(table.items()):
+        offset = 0.7 * ((i + 0.5) / len(table) - 0.5)
+        columns = [column for column, name in enumerate(names) if name in row]
+        means = [row[names[column]].mean_return for column in columns]
+        _plot_intervals(ax, i, agent, [column + offset for column in columns], means, linestyle="none")
+    ax.set_xticks(range(len(names)), [_in_lines(name) for name in names], fontsize="small")
+    ax.set_xlim(-0.5, len(names) - 0.5)
+    ax.set_xlabel("random delay")
+
+
+def _plot_intervals(
+    ax: Axes, i: int, agent: str, x: Sequence[float], means: Sequence[Interval], linestyle: str
+) -> None:
+    """Draw the means of the i-th agent with their intervals."""
+    ax.errorbar(
+        x, [m.value for m in means], yerr=[[m.value - m.low for m in means], [m.high - m.value for m in means]],
+        color=COLORS[i % len(COLORS)], marker=MARKERS[i % len(MARKERS)], markersize=5, elinewidth=1, capsize=2,
+        linestyle=linestyle, label=agent,
+    )  # fmt: skip
+
+
+def _in_lines(name: str) -> str:
+    """Break the name of a process into lines that fit under a tick."""
+    head, bracket, rest = name.partition("(")
+    return "\n".join(line for line in [head, *textwrap.wrap(bracket + rest, 17, break_long_words=False)] if line)
 
 
 def _running_total(counts: Sequence[float]) -> list[float]:

@@ -3,42 +3,26 @@
 from __future__ import annotations
 
 import json
-from collections import OrderedDict
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
-import yaml
 
 pytest.importorskip("rl_zoo3")
 
 import enjoy
 import evaluate
 from runs import load_run
+from small_run import ENV, TINY_PLANNER, write_run
 
 from sb3_said import SAID, DelayedObservationWrapper
 from sb3_said.evaluation import rollout
 
-ENV = "InvertedPendulum-v5"
-
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run folder as rl_zoo3 leaves it, of an agent that has hardly been trained."""
-    folder = tmp_path_factory.mktemp("said") / f"{ENV}-delay2_1"
-    planner = {"depth": 1, "d_model": 32, "horizon": 4, "sampling_steps": 2, "n_candidates": 2}
-    model = SAID(
-        "MultiInputPolicy", DelayedObservationWrapper(gym.make(ENV), delay=2), learning_starts=50, buffer_size=500,
-        planner_kwargs=planner, planner_gradient_steps=2, seed=0, device="cpu",
-    )  # fmt: skip
-    model.learn(100)
-    model.save(folder / f"{ENV}.zip")
-    (folder / ENV).mkdir()
-    config = OrderedDict(env_wrapper=[{"sb3_said.delays.DelayedObservationWrapper": {"delay": 2}}], n_timesteps=100)
-    (folder / ENV / "config.yml").write_text(yaml.dump(config))
-    (folder / ENV / "args.yml").write_text(yaml.dump(OrderedDict(algo="said", env=ENV, env_kwargs=None)))
-    return folder
+    return write_run(tmp_path_factory.mktemp("said") / f"{ENV}-delay2_1", SAID, 2, steps=100)
 
 
 def test_evaluate_measures_the_planner_and_the_expert(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -179,3 +163,12 @@ def test_videos_follow_a_robot_that_has_a_camera_for_it(env_id, camera):
     enjoy.follow(env)
     assert env.unwrapped.mujoco_renderer.camera_id == camera
     env.close()
+
+
+def test_an_agent_that_reads_a_state_history_plays_without_its_run_folder(tmp_path: Path) -> None:
+    env = DelayedObservationWrapper(gym.make(ENV), delay=2, state_history=True)
+    planner = {**TINY_PLANNER, "extra_state_probability": 0.5}
+    SAID("MultiInputPolicy", env, device="cpu", planner_kwargs=planner).save(tmp_path / "agent.zip")
+    run = load_run(str(tmp_path / "agent.zip"), "said", ENV, delay=1)
+    assert set(run.make_env().observation_space.spaces) >= {"state_history", "state_known"}
+    assert rollout(run.model, run.make_env, 1, seed=0).lengths[0] > 0

@@ -1,0 +1,305 @@
+"""Play trained agents under several delays, and report return over delay."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import multiprocessing
+import re
+import warnings
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+from runs import LoadedRun, answering, answers, load_run, longest_delay, origin
+from winner import write_text
+from zoo import Delay, largest_delay, read_delay
+
+from sb3_said.delays import FixedDelay
+from sb3_said.delays.processes import make_process
+from sb3_said.evaluation import Summary, bootstrap_interval, plots, rollout
+
+EPILOG = """\
+examples:
+  # one agent of all delays beside one of a single delay: a table, the numbers, a plot
+  python scripts/over_delays.py logs/said/Hopper-v5-delay0-16_1 logs/sadr/Hopper-v5-delay8_1 \\
+      --delays 0 2 4 8 12 16 "UniformDelay(0, 8)" WIFI_20MS "RandomWalkDelay(0, 16, move_prob=0.1)" \\
+      --json hopper.json --plot hopper.png
+
+  # the same call goes on where it was stopped; with another run or delay, only what is new is played
+  python scripts/over_delays.py any=logs/said/Hopper-v5-delay0-16_1 d8=logs/sadr/Hopper-v5-delay8_1/best_model.zip \\
+      --delays 0 2 4 8 12 16 20 --json hopper.json --workers 2
+
+Of a SAID agent, the planner and the expert are played. An agent cannot play delays that it was not built for: such a
+cell stays empty. It does play delays that it was not trained with, which is the point here, without a warning.
+Episode i starts from reset seed --seed + i under every delay, so that all cells meet the same starts. An average over
+delays has an interval over these starts, each with its mean over the delays.
+What --json holds of the same agents (by the contents of their files) is not played again; an agent that has changed
+is. Cells of other agents and delays are kept in it.
+A run folder's YAML can run code (rl_zoo3 reads it so): open only folders that you trust.
+"""
+
+
+def make_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("runs", nargs="+", metavar="[LABEL=]RUN_OR_ZIP", help="run folders, or agents' .zip files")
+    parser.add_argument("--delays", nargs="+", required=True, metavar="DELAY", help="each a number of control steps, "
+                        "or a process of docs/delays.md in quotes, such as 'DroppedPackets(4, p=0.1)'")  # fmt: skip
+    parser.add_argument("--json", type=Path, required=True, help="where to write the numbers, and to go on from them")
+    parser.add_argument("--plot", type=Path, help="draw return over delay to this .png or .pdf")
+    parser.add_argument("--episodes", type=int, default=20, help="whole episodes for each cell (default: 20)")
+    parser.add_argument("--seed", type=int, default=10_000, help="reset seed of the first episode (default: 10000)")
+    parser.add_argument("--n-envs", type=int, default=8, help="episodes played side by side (default: 8)")
+    parser.add_argument("--workers", type=int, default=1, help="cells played at once, in processes (default: 1)")
+    parser.add_argument("--algo", help="algorithm of .zip files without their run folder")
+    parser.add_argument("--env", help="task to play (default: the trained one)")
+    parser.add_argument("--device", default="auto", help="torch device (default: auto)")
+    parser.add_argument("--num-threads", type=int, default=1, help="torch threads of each worker (default: 1)")
+    return parser
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One agent under one delay."""
+
+    agent: str
+    answer: str | None
+    """planner or expert of a SAID agent"""
+    delay: int | str
+    """control steps, or a process as it was written"""
+    algo: str
+    file: str
+    sha256: str
+    """of the file"""
+    trained_steps: int
+    obstacle: str | None
+    """why the agent cannot play this delay"""
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = make_parser()
+    args = parser.parse_args(argv)
+    if min(args.episodes, args.n_envs, args.workers, args.num_threads) < 1:
+        parser.error("--episodes, --n-envs, --workers and --num-threads must be at least 1")
+    th.set_num_threads(args.num_threads)
+    try:
+        if args.plot is not None:
+            plots.panels()  # without matplotlib, fail now and not after the episodes
+        delays = list(dict.fromkeys(read_name(word) for word in args.delays))
+        runs = open_runs(args)
+        env_id = next(iter(runs.values())).info["env"]
+        settings = {"env": env_id, "n_episodes": args.episodes, "seed": args.seed, "deterministic": True}
+        cells = [cell for label, run in runs.items() for cell in cells_of(label, run, delays)]
+        results = Results(args.json, settings, cells)
+    except ValueError as error:
+        parser.error(str(error))
+    except ImportError as error:
+        parser.exit(1, f"{error}\n")
+
+    for cell in cells:
+        if cell.obstacle is not None:
+            print(f"{cell.agent} cannot play delay {cell.delay}: {cell.obstacle}.")
+    todo = [cell for cell in cells if cell not in results.found]
+    last_seed = args.seed + args.episodes - 1
+    print(f"{env_id}, reset seeds {args.seed}..{last_seed}: {len(todo)} of {len(cells)} cells to play")
+    if todo:
+        results.origins.append(origin(next(iter(runs.values()))))
+    try:
+        for done, (cell, summary) in enumerate(play_all(todo, env_id, args), 1):
+            results.add(cell, summary)
+            print(f"{done}/{len(todo)} {cell.agent}, delay {cell.delay}: {summary.mean_return}", flush=True)
+    except KeyboardInterrupt:
+        parser.exit(130, "\nInterrupted; the same command goes on.\n")
+    results.write()
+
+    table = results.table()
+    print_table(table, delays)
+    print(f"Wrote {args.json}")
+    if args.plot is not None and any(table.values()):
+        plots.save(plots.plot_over_delays(table)[0], args.plot)
+        print(f"Wrote {args.plot}")
+
+
+def read_name(word: str) -> int | str:
+    """Return the number of a fixed delay, and another process as it is written.
+
+    :raises ValueError: for no delay
+    """
+    delay = read_delay([word])
+    assert delay is not None  # for mypy: there is a word
+    process = make_process(delay)
+    return process.delay if isinstance(process, FixedDelay) else word
+
+
+def open_runs(args: argparse.Namespace) -> dict[str, LoadedRun]:
+    """Return what each label names.
+
+    :raises ValueError: for what cannot be opened, two runs of one label, or runs of several tasks
+    """
+    runs: dict[str, LoadedRun] = {}
+    for text in args.runs:
+        given, path = re.fullmatch(r"(?:([^=/]+)=)?(.*)", text, re.DOTALL).groups()  # type: ignore[union-attr]  # fits all
+        label = given or "/".join(Path(path).absolute().parts[-2:]).removesuffix(".zip")
+        if label in runs:
+            raise ValueError(f"Two runs have the label {label}: give each its own, as in LABEL={path}.")
+        runs[label] = open_run(path, args.algo, args.env, None, args.device)
+    tasks = {label: run.info["env"] for label, run in runs.items()}
+    if len(set(tasks.values())) > 1:
+        raise ValueError(f"Returns of several tasks cannot be compared: {tasks}. Give runs of one task, or --env.")
+    return runs
+
+
+def open_run(path: str, algo: str | None, env_id: str | None, delay: Delay, device: str) -> LoadedRun:
+    """Open a run without the warning that it was not trained with this delay, which is what is measured here."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", r"This \w+ learned under .* and is given", UserWarning)
+        return load_run(path, algo, env_id, delay, device)
+
+
+def cells_of(label: str, run: LoadedRun, delays: list[int | str]) -> Iterator[Cell]:
+    """Make the cells of a run: each who can answer, under each delay."""
+    file = run.info["file"]
+    digest = hashlib.sha256(Path(file).read_bytes()).hexdigest()
+    who: list[str | None] = [*answers(run.model)] or [None]
+    for answer in who:
+        for delay in delays:
+            yield Cell(
+                agent=f"{label} {answer}" if answer else label,
+                answer=answer,
+                delay=delay,
+                algo=run.info["algo"],
+                file=file,
+                sha256=digest,
+                trained_steps=run.info["trained_steps"],
+                obstacle=obstacle(run.model, answer, delay),
+            )
+
+
+def obstacle(model: Any, answer: str | None, delay: int | str) -> str | None:
+    """Say why an agent cannot play under a delay; None where it can.
+
+    :param model: an SB3 algorithm, whose policy has a planner where that answers
+    """
+    longest = longest_delay(model) or 0
+    if largest_delay(delay) > longest:
+        return f"it was built for delays 0..{longest}"
+    if answer == "planner" and delay != longest and model.policy.planner.config.mask == "fixed":
+        return f"its planner was trained for delay {longest} alone"
+    return None
+
+
+class Results:
+    """What was played, in a JSON file that is whole at any time.
+
+    :param path: of the file; what it holds of these cells is taken over, what it holds of others is kept
+    :param settings: what all cells have in common
+    :param cells: of the table, row by row
+    :raises ValueError: for a file with other settings
+    """
+
+    def __init__(self, path: Path, settings: dict[str, Any], cells: list[Cell]):
+        self.path, self.settings, self.cells = path, settings, cells
+        document = {**settings, "origins": [], "cells": []}
+        if path.exists():
+            document = json.loads(path.read_text())
+            held = {key: document.get(key) for key in settings}
+            if held != settings or "cells" not in document:
+                raise ValueError(f"{path} holds {held}, but {settings} is to be played: give another --json.")
+        self.origins: list[dict[str, Any]] = document["origins"]
+        old = {_key(entry): entry for entry in document["cells"]}
+        #: JSON entries beside what the cell says: its result, and which of the origins made it
+        self.found: dict[Cell, dict[str, Any]] = {}
+        for cell in cells:
+            entry = old.pop(_key(asdict(cell)), None)
+            if cell.obstacle is not None:
+                self.found[cell] = {"origin": None, "result": None}
+            elif entry is not None:
+                self.found[cell] = {key: entry[key] for key in ("origin", "result")}
+        asked = {cell.file: cell.sha256 for cell in cells}
+        self.others = [entry for entry in old.values() if asked.get(entry["file"], entry["sha256"]) == entry["sha256"]]
+
+    def add(self, cell: Cell, summary: Summary) -> None:
+        """Keep what was played now."""
+        result = summary.to_dict()
+        del result["label"]  # the cell has it, and another call can give the agent another one
+        self.found[cell] = {"origin": len(self.origins) - 1, "result": result}
+        self.write()
+
+    def write(self) -> None:
+        """Write the file, whole or not at all."""
+        cells = [{**asdict(cell), **self.found[cell]} for cell in self.cells if cell in self.found]
+        document = {**self.settings, "origins": self.origins, "cells": cells + self.others}
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        write_text(self.path, json.dumps(document, indent=2, allow_nan=False) + "\n")
+
+    def table(self) -> dict[str, dict[int | str, Summary]]:
+        """Return for each agent what it did under each delay that it could play."""
+        table: dict[str, dict[int | str, Summary]] = {cell.agent: {} for cell in self.cells}
+        for cell in self.cells:
+            if (result := self.found[cell]["result"]) is not None:
+                table[cell.agent][cell.delay] = Summary.from_episodes(cell.agent, result["returns"], result["lengths"])
+        return table
+
+
+def _key(entry: dict[str, Any]) -> tuple[str, ...]:
+    return entry["sha256"], str(entry["answer"]), repr(make_process(entry["delay"]))
+
+
+def play_all(cells: list[Cell], env_id: str, args: argparse.Namespace) -> Iterator[tuple[Cell, Summary]]:
+    """Play cells, in processes if more than one are to be played at once; yields them as they are done."""
+    how = (env_id, args.episodes, args.seed, args.n_envs, args.device)
+    if args.workers == 1:
+        yield from ((cell, play(cell, *how)) for cell in cells)
+        return
+    context = multiprocessing.get_context("spawn")  # forked processes would share torch's threads
+    pool = ProcessPoolExecutor(args.workers, context, initializer=th.set_num_threads, initargs=(args.num_threads,))
+    try:
+        futures = {pool.submit(play, cell, *how): cell for cell in cells}
+        yield from ((futures[future], future.result()) for future in as_completed(futures))
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def play(cell: Cell, env_id: str, episodes: int, seed: int, n_envs: int, device: str) -> Summary:
+    """Play the episodes of a cell."""
+    run = open_run(cell.file, cell.algo, env_id, cell.delay, device)
+    with answering(run.model, cell.answer):
+        played = rollout(run.model, run.make_env, episodes, seed, n_envs, normalize=run.normalize)
+    return Summary.from_episodes(cell.agent, played.returns, played.lengths)
+
+
+def print_table(table: dict[str, dict[int | str, Summary]], delays: list[int | str]) -> None:
+    """Print a Markdown table: one row for each agent, one column for each delay, then the averages."""
+    columns: dict[str, list[int | str]] = {str(delay): [delay] for delay in delays}
+    for name, kind in (("mean of fixed", int), ("mean of random", str)):
+        columns[name] = [delay for delay in delays if isinstance(delay, kind)]
+    rows = [["return under delay", *columns]]
+    rows += [[agent, *(average(row, column) for column in columns.values())] for agent, row in table.items()]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    rows.insert(1, ["-" * width for width in widths])
+    for row in rows:
+        print("| " + " | ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)) + " |")
+
+
+def average(row: dict[int | str, Summary], delays: list[int | str]) -> str:
+    """Write the mean return over delays, with its interval over reset seeds.
+
+    :param row: of an agent
+    :param delays: those that the agent cannot play are left out, and the rest is counted
+    """
+    returns = [row[delay].returns for delay in delays if delay in row]
+    if not returns:
+        return "-"
+    interval = str(bootstrap_interval(np.mean(returns, axis=0)))  # from (delays, n_episodes)
+    return interval if len(returns) == len(delays) else f"{interval}, {len(returns)} of {len(delays)}"
+
+
+if __name__ == "__main__":
+    main()
