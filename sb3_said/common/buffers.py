@@ -28,7 +28,8 @@ class DelayedReplayBuffer(ReplayBuffer):
     Each row holds s_t, a_t, r_t, done, timeout, the age of the observation at t and the step t within its episode.
     s_{t+1} is the next row's state, except where no row continues the episode; there it is kept aside (a *tail*).
     Sampling returns what a store of whole transitions would, bit for bit. For a delayed observation space the sampled
-    observations have the extra key ``undelayed_observation``, the true state, for a delay-reconciled critic.
+    observations have the extra key ``undelayed_observation``, the true state, for a delay-reconciled critic, and no
+    ``state_history``, which neither actor nor critics read.
 
     The stored action is the one that ``action_history`` says was executed, so that it agrees with the histories.
 
@@ -394,7 +395,10 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
         raise ValueError(f"Expected a bounded 1-D Box action space, got {action_space}; use gymnasium's RescaleAction.")
     state_space, max_delay = observation_space, 0
     if isinstance(observation_space, spaces.Dict):
-        if set(observation_space.keys()) != {"observation", "action_history", "delay"}:
+        keys = {"observation", "action_history", "delay"}
+        if has_state_history(observation_space):
+            keys |= {"state_history", "state_known"}
+        if set(observation_space.keys()) != keys:
             raise ValueError(
                 "Expected the dict observation of DelayedObservationWrapper (observation, action_history, delay), "
                 f"got the keys {sorted(observation_space.keys())}; wrap the task in it."
@@ -404,3 +408,8 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
     if not (isinstance(state_space, spaces.Box) and len(state_space.shape) == 1):
         raise ValueError(f"Expected a 1-D Box observation, got {state_space}; use gymnasium's FlattenObservation.")
     return state_space, max_delay
+
+
+def has_state_history(observation_space: spaces.Space[Any]) -> bool:
+    """Tell whether a space is of a ``DelayedObservationWrapper`` with ``state_history=True``."""
+    return isinstance(observation_space, spaces.Dict) and "state_history" in observation_space.spaces

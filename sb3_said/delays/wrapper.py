@@ -29,6 +29,11 @@ class DelayedObservationWrapper(
       bounds of the action space, zeros before the episode;
     - ``delay`` (1,): the age of ``observation`` in control steps, plus those that actions take.
 
+    With ``state_history=True`` also what an agent that remembers would have, in the rows of the actions that led there:
+
+    - ``state_history`` (D, obs_dim): the states s_{t-D+1..t}, oldest first, zeros where unknown;
+    - ``state_known`` (D,): 1 for each of these that was handed out as ``observation`` so far in the episode, else 0.
+
     At reset s_0 arrives with age 0, and ages while it is all that has arrived, so an episode starts as a task with a
     smaller delay. ``info["undelayed_observation"]`` is the true state after the step, for replay and diagnosis only;
     ``info["forced_deliveries"]`` counts the packets of the episode that were delivered only because the age would have
@@ -47,6 +52,8 @@ class DelayedObservationWrapper(
         was built for it.
     :param receiver: ``"newest"`` keeps the newest observation that has arrived; ``"independent"`` reads an age drawn
         anew at every step (paper, section 2)
+    :param state_history: see above; under ``"independent"`` states younger than ``observation`` may be known, under
+        ``"newest"`` none are
     :raises ValueError: for other spaces, a bad delay, an unknown receiver, or a ``max_delay`` below the largest delay
 
     >>> env = DelayedObservationWrapper(gym.make("Pendulum-v1"), delay=2)
@@ -68,9 +75,15 @@ class DelayedObservationWrapper(
         *,
         max_delay: int | None = None,
         receiver: str = "newest",
+        state_history: bool = False,
     ):
         gym.utils.RecordConstructorArgs.__init__(
-            self, delay=delay, action_delay=action_delay, max_delay=max_delay, receiver=receiver
+            self,
+            delay=delay,
+            action_delay=action_delay,
+            max_delay=max_delay,
+            receiver=receiver,
+            state_history=state_history,
         )
         gym.Wrapper.__init__(self, env)
         obs_space, act_space = env.observation_space, env.action_space
@@ -103,14 +116,22 @@ class DelayedObservationWrapper(
         self._action_is_scaled = bool(np.all(act_space.low == -1) and np.all(act_space.high == 1))
         with np.errstate(over="ignore"):  # a float64 bound beyond float32 becomes infinite
             low, high = (bound.astype(np.float32) for bound in (obs_space.low, obs_space.high))
-        self.observation_space = spaces.Dict(  # type: ignore[assignment]  # a Dict is a Space[dict[str, Any]]
-            observation=spaces.Box(low, high, dtype=np.float32),
-            action_history=spaces.Box(-1.0, 1.0, (self.max_delay, *act_space.shape), np.float32),
-            delay=spaces.Box(0.0, float(self.max_delay), (1,), np.float32),
-        )
+        parts: dict[str, spaces.Space[Any]] = {
+            "observation": spaces.Box(low, high, dtype=np.float32),
+            "action_history": spaces.Box(-1.0, 1.0, (self.max_delay, *act_space.shape), np.float32),
+            "delay": spaces.Box(0.0, float(self.max_delay), (1,), np.float32),
+        }
+        self.state_history = state_history
+        if state_history:
+            low, high = (np.tile(bound, (self.max_delay, 1)) for bound in (np.minimum(low, 0), np.maximum(high, 0)))
+            parts["state_history"] = spaces.Box(low, high, dtype=np.float32)
+            parts["state_known"] = spaces.Box(0.0, 1.0, (self.max_delay,), np.float32)
+        self.observation_space = spaces.Dict(parts)  # type: ignore[assignment]  # a Dict is a Space[dict[str, Any]]
         self._rng = np.random.default_rng()
         self._states: deque[np.ndarray] = deque(maxlen=self.max_delay + 1)
         self._history = np.zeros((self.max_delay, *act_space.shape), np.float32)
+        self._received = np.zeros((self.max_delay + 1, *obs_space.shape), np.float32)  # s_{t-D..t}, zeros where unknown
+        self._is_received = np.zeros(self.max_delay + 1, np.float32)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -126,7 +147,7 @@ class DelayedObservationWrapper(
             self._rng = np.random.default_rng([seed, DELAY_STREAM])
         self.receiver.reset(self._rng)
         self._states.clear()
-        self._history[:] = 0.0
+        self._history[:] = self._received[:] = self._is_received[:] = 0.0
         return self._observe(state, age=0), self._with_state(info)
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict[str, Any]]:
@@ -145,11 +166,20 @@ class DelayedObservationWrapper(
 
     def _observe(self, state: np.ndarray, age: int) -> dict[str, np.ndarray]:
         self._states.append(np.asarray(state, dtype=np.float32).copy())
-        return {
+        obs = {
             "observation": self._states[-1 - age].copy(),
             "action_history": self._history.copy(),
             "delay": np.array([age], dtype=np.float32),
         }
+        return obs | self._remember(obs["observation"], age) if self.state_history else obs
+
+    def _remember(self, observation: np.ndarray, age: int) -> dict[str, np.ndarray]:
+        """Return all that was handed out, this observation included."""
+        for rows in (self._received, self._is_received):
+            rows[:-1] = rows[1:]
+            rows[-1] = 0.0
+        self._received[-1 - age], self._is_received[-1 - age] = observation, 1.0
+        return {"state_history": self._received[1:].copy(), "state_known": self._is_received[1:].copy()}
 
     def _with_state(self, info: dict[str, Any]) -> dict[str, Any]:
         return {

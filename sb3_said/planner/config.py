@@ -36,6 +36,9 @@ class PlannerConfig:
     time_sampling: str = "logit_normal"  # measured: lower error of the decoded present; or "uniform" (DV)
     mask: str = "random"  # one network for every delay; or "fixed" at max_delay (paper)
     mask_end_probability: float = 0.5  # a guess: the longest mask is the hardest; in [0, 1]
+    # Part of the training windows that show more states than the first, any subset of those up to the decision index:
+    # 0 is the paper's; above it, late observations can be given to plan(), and 0.5 is a guess; in [0, 1]
+    extra_state_probability: float = 0.0
     relative_states: bool = True  # measured: a third off the present's error; or False (paper)
     decision_weight: float = 5.0  # measured: factor on the error at the decision index; 1 (paper) to 5, 20 was worse
     action_transform: str = "standard"  # measured: z-score; or "tanh" (paper): clip to 0.999, arctanh, z-score
@@ -89,7 +92,7 @@ class PlannerConfig:
                 f"learning_rate is {self.learning_rate} and gradient_clip {self.gradient_clip}, expected positive "
                 "numbers; to switch clipping off, give gradient_clip=None."
             )
-        for name in ("mask_end_probability", "ema_decay"):
+        for name in ("mask_end_probability", "extra_state_probability", "ema_decay"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected a number in [0, 1].")
 

@@ -92,6 +92,7 @@ class DiT1d(nn.Module):
     :param depth: number of blocks
     :param positions: ``"sinusoidal"`` (fixed) or ``"learned"``
     :param embed_known: add an embedding of the whole known part to every token, beside showing it in its place
+    :param extra_states: states at indices 1..D may be known too, and are embedded
     :raises ValueError: for a width that is no multiple of 32 or an unknown kind of positions
     """
 
@@ -108,6 +109,7 @@ class DiT1d(nn.Module):
         depth: int = 2,
         positions: str = "sinusoidal",
         embed_known: bool = True,
+        extra_states: bool = False,
     ) -> None:
         super().__init__()
         if d_model < HEAD_DIM or d_model % HEAD_DIM:
@@ -117,9 +119,11 @@ class DiT1d(nn.Module):
         self.d_model = d_model
         self.obs_dim = obs_dim
         self.max_delay = max_delay
+        self.extra_states = extra_states
         self.token_embedding = nn.Linear(obs_dim + act_dim, d_model)
         self.flag_embedding = nn.Linear(2, d_model, bias=False)
-        self.known_embedding = _mlp(obs_dim + max_delay * (act_dim + 1), d_model) if embed_known else None
+        n_known = obs_dim + max_delay * (act_dim + 1 + extra_states * (obs_dim + 1))
+        self.known_embedding = _mlp(n_known, d_model) if embed_known else None
         self.time_embedding = _mlp(N_TIME_FEATURES, d_model)
         # One linear map for the modulations of all blocks (6 each) and of the output (2): one product instead of many
         self.modulation = nn.Linear(d_model, (6 * depth + 2) * d_model)
@@ -168,11 +172,18 @@ class DiT1d(nn.Module):
             return added
         given = th.where(known, window, 0.0)
         state = given[:, 0, : self.obs_dim]
-        # (B, D, act_dim + 1): actions, and whether they are known; none are behind the end of a shorter window
-        actions = th.cat([given[..., self.obs_dim :], flags[..., 1:]], dim=-1)[:, : self.max_delay]
-        actions = F.pad(actions, (0, 0, 0, self.max_delay - actions.shape[1]))
-        part = th.cat([state, actions[..., :-1].flatten(1), actions[..., -1]], dim=1)
-        return added + self.known_embedding(part)[:, None]
+        # Actions, and whether they are known
+        actions = self._up_to_max_delay(th.cat([given[..., self.obs_dim :], flags[..., 1:]], dim=-1))
+        parts = [state, actions[..., :-1].flatten(1), actions[..., -1]]
+        if self.extra_states:  # states behind the first, and whether they are known
+            states = self._up_to_max_delay(th.cat([given[..., : self.obs_dim], flags[..., :1]], dim=-1)[:, 1:])
+            parts.append(states.flatten(1))
+        return added + self.known_embedding(th.cat(parts, dim=1))[:, None]
+
+    def _up_to_max_delay(self, rows: th.Tensor) -> th.Tensor:
+        """Return the first D rows of (B, L, n), zeros behind the end of a shorter window: (B, D, n)."""
+        rows = rows[:, : self.max_delay]
+        return F.pad(rows, (0, 0, 0, self.max_delay - rows.shape[1]))
 
     def forward(
         self, x: th.Tensor, context: th.Tensor, modulations: th.Tensor, valid: th.Tensor | None = None

@@ -1,4 +1,9 @@
-"""What of a window is known: the delayed observation and the actions sent since (the paper's section on SAID)."""
+"""What of a window is known: the delayed observation and the actions sent since (the paper's section on SAID).
+
+Observations that arrive late or out of order are known too: any of the states s_{t-D+1..t}. Those younger than s_{t-d}
+lie at indices 1..d of the window. Older ones lie before it, and are dropped: by the Markov property they say nothing
+about what follows s_{t-d} that it does not say itself.
+"""
 
 from __future__ import annotations
 
@@ -8,33 +13,59 @@ import torch.nn.functional as F
 MASKS = ("random", "fixed")
 
 
-def known_mask(delay: th.Tensor, length: int, obs_dim: int, act_dim: int) -> th.Tensor:
+def known_mask(
+    delay: th.Tensor, length: int, obs_dim: int, act_dim: int, state_known: th.Tensor | None = None
+) -> th.Tensor:
     """Return the known mask: (B, L, obs_dim + act_dim) bool, the state at index 0 and the actions at 0..d-1.
 
     :param delay: (B,) int64 observation delays d, each in 0..L
     :param length: L, steps of a window
+    :param state_known: (B, D) bool, which of the states s_{t-D+1..t} are known too; none by default
     """
     steps = th.arange(length, device=delay.device)
-    state_known = (steps == 0).expand(len(delay), -1)  # (B, L)
-    action_known = steps < delay[:, None]  # (B, L)
-    return th.cat([state_known[..., None].expand(-1, -1, obs_dim), action_known[..., None].expand(-1, -1, act_dim)], -1)
+    known_states = (steps == 0).expand(len(delay), -1)  # (B, L)
+    if state_known is not None:
+        known_states = th.cat([known_states[:, :1], _newest(state_known[..., None], delay, length - 1)[..., 0]], dim=1)
+    known_actions = steps < delay[:, None]  # (B, L)
+    return th.cat(
+        [known_states[..., None].expand(-1, -1, obs_dim), known_actions[..., None].expand(-1, -1, act_dim)], dim=-1
+    )
 
 
-def known_window(observation: th.Tensor, action_history: th.Tensor, delay: th.Tensor, length: int) -> th.Tensor:
-    """Write the known entries into their places: (B, L, obs_dim + act_dim), unknown entries are 0.
+def known_window(
+    observation: th.Tensor,
+    action_history: th.Tensor,
+    delay: th.Tensor,
+    length: int,
+    state_history: th.Tensor | None = None,
+) -> th.Tensor:
+    """Write the known entries into their places: (B, L, obs_dim + act_dim).
+
+    Unknown entries are 0, or what the state history has in their places.
 
     :param observation: (B, obs_dim) delayed observation s_{t-d}
     :param action_history: (B, D, act_dim), the D newest actions, oldest first; D may be 0
     :param delay: (B,) int64 observation delays d, each in 0..D
-    :param length: L >= D, steps of a window
+    :param length: L > D, steps of a window
+    :param state_history: (B, D, obs_dim), the states s_{t-D+1..t} as far as known, each in the row of the action that
+        led to it; none by default
     """
-    _, max_delay, act_dim = action_history.shape
-    states = F.pad(observation[:, None], (0, 0, 0, length - 1))  # (B, L, obs_dim)
-    # Of a delay d the d newest actions are known, from D - d on; zeros behind the newest fill the unknown places
-    padded = F.pad(action_history, (0, 0, 0, length))  # (B, D + L, act_dim)
-    index = max_delay - delay[:, None] + th.arange(length, device=delay.device)  # (B, L)
-    actions = padded.gather(1, index[..., None].expand(-1, -1, act_dim))  # (B, L, act_dim)
-    return th.cat([states, actions], dim=-1)
+    if state_history is None:
+        states = F.pad(observation[:, None], (0, 0, 0, length - 1))  # (B, L, obs_dim)
+    else:
+        states = th.cat([observation[:, None], _newest(state_history, delay, length - 1)], dim=1)
+    return th.cat([states, _newest(action_history, delay, length)], dim=-1)
+
+
+def _newest(history: th.Tensor, delay: th.Tensor, length: int) -> th.Tensor:
+    """Return the d newest rows of a history, and zeros behind them: (B, length, n).
+
+    :param history: (B, D, n), oldest first
+    :param delay: (B,) int64, d
+    """
+    padded = F.pad(history, (0, 0, 0, length))  # (B, D + length, n)
+    index = history.shape[1] - delay[:, None] + th.arange(length, device=delay.device)  # (B, length)
+    return padded.gather(1, index[..., None].expand(-1, -1, history.shape[2]))
 
 
 def draw_delays(
@@ -61,3 +92,24 @@ def draw_delays(
     ends = max_delay * th.randint(2, (batch_size,), generator=generator, device=source)
     at_end = th.rand(batch_size, generator=generator, device=source) < end_probability
     return th.where(at_end, ends, uniform).to(device)
+
+
+def draw_known_states(
+    batch_size: int,
+    max_delay: int,
+    probability: float,
+    generator: th.Generator | None = None,
+    device: th.device | str = "cpu",
+) -> th.Tensor:
+    """Draw which of the states s_{t-D+1..t} a training batch shows: (B, D) bool.
+
+    In a window that shows any, each is known with a probability of the window's own, uniform in [0, 1]: then any number
+    of them is as likely as any other.
+
+    :param probability: of a window to show any
+    """
+    source = "cpu" if generator is None else generator.device
+    shows_any = th.rand(batch_size, 1, generator=generator, device=source) < probability
+    share = th.rand(batch_size, 1, generator=generator, device=source)
+    known = th.rand(batch_size, max_delay, generator=generator, device=source) < share
+    return (known & shows_any).to(device)

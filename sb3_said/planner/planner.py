@@ -64,6 +64,7 @@ class InpaintingPlanner(nn.Module):
             config.depth,
             config.positions,
             config.embed_known,
+            config.extra_state_probability > 0,
         )
         self.normalizer = Normalizer(
             obs_dim, act_dim, self.window_length, config.action_transform, config.relative_states
@@ -105,12 +106,13 @@ class InpaintingPlanner(nn.Module):
         """Return the weighted mean squared error over unknown entries of valid steps (the paper's Algorithm 1).
 
         The decision index counts ``config.decision_weight`` times as much as the others. Of a window of delay d only
-        the first d + ``config.horizon`` steps exist.
+        the first d + ``config.horizon`` steps exist. Which states are known beside the first is drawn as
+        ``config.extra_state_probability`` says.
 
         :param windows: B windows of ``window_length`` steps, environment units
         :param delay: (B,) mask lengths; drawn as ``config.mask`` says by default
         :param weight: (B,) factor of each window's error; 1 by default
-        :param generator: of mask lengths, noise and times; torch's global one by default
+        :param generator: of mask lengths, known states, noise and times; torch's global one by default
         :return: float32 scalar
         :raises ValueError: for windows of another shape or delays outside 0..max_delay (on a GPU, delays are not read)
         """
@@ -129,7 +131,13 @@ class InpaintingPlanner(nn.Module):
         clean = self.normalizer.normalize(states, actions)  # (B, L, obs_dim + act_dim)
         # Steps behind an episode's end repeat its last row: they are neither shown as known nor learned, and no more
         # are those behind the horizon, so that a decision at a small delay can do without them
-        known = inpainting.known_mask(delay, self.window_length, self.obs_dim, self.act_dim) & valid[..., None]
+        state_known = None
+        if config.extra_state_probability > 0:
+            state_known = inpainting.draw_known_states(
+                n, self.max_delay, config.extra_state_probability, generator, device
+            )
+        known = inpainting.known_mask(delay, self.window_length, self.obs_dim, self.act_dim, state_known)
+        known = known & valid[..., None]
         noise = self._noise(clean.shape, generator)
         t = diffusion.draw_times(n, config.schedule, config.time_sampling, generator, device)
         alpha, sigma = (factor[:, None, None] for factor in diffusion.alpha_sigma(t, config.schedule))
@@ -158,6 +166,8 @@ class InpaintingPlanner(nn.Module):
         temperature: float | None = None,
         noise: th.Tensor | None = None,
         generator: th.Generator | None = None,
+        state_history: th.Tensor | None = None,
+        state_known: th.Tensor | None = None,
     ) -> Plan:
         """Inpaint N candidate windows per decision and choose the one of the highest mean value (MCSS).
 
@@ -181,7 +191,12 @@ class InpaintingPlanner(nn.Module):
         :param noise: (N, ``window_length``, obs_dim + act_dim) standard normal initial noise, shared by all decisions,
             to repeat a plan
         :param generator: of the initial noise where none is given; torch's global one by default
-        :raises ValueError: for wrong shapes, numbers that are not finite, or delays outside 0..max_delay
+        :param state_history: (B, D, obs_dim), the states s_{t-D+1..t}, oldest first, any finite numbers where they are
+            not known. Those younger than s_{t-d} stay as they are in every candidate; older ones add nothing (Markov
+            property) and are not read. Needs ``config.extra_state_probability`` above 0
+        :param state_known: (B, D), 1 where a state of ``state_history`` is known and 0 elsewhere; none is by default
+        :raises ValueError: for wrong shapes, numbers that are not finite, delays outside 0..max_delay, or extra states
+            that the network was not trained with
         """
         config = self.config
         observation, action_history = self._tensor(observation), self._tensor(action_history)
@@ -189,6 +204,7 @@ class InpaintingPlanner(nn.Module):
         n = len(observation)
         _check("action_history", action_history, (n, self.max_delay, self.act_dim))
         delay = self._delay(delay, n)
+        extra_states = self._extra_states(state_history, state_known, n)
         shortest, longest = int(delay.min()), int(delay.max())
         length = longest + config.horizon  # a decision costs what its age costs
         temperature = config.temperature if temperature is None else temperature
@@ -215,7 +231,7 @@ class InpaintingPlanner(nn.Module):
             noise = self._noise((n, n_candidates, *shape), generator)
         x = temperature * noise[..., :n_candidates, :, :].expand(n, -1, -1, -1)  # (B, N, L, obs_dim + act_dim)
         prepared = self._cache.prepare(self, self.network, steps, compute_dtype(config.precision, self.device))
-        inputs = (observation, action_history, delay, x)
+        inputs = (observation, action_history, delay, x, *extra_states)
         if self._can_be_graphed(value_fn):
             key = (config, tuple(x.shape), value_fn, addresses(self if value_fn is None else _owner(value_fn)))
             graph = self._cache.graph(key, partial(self._inpaint, prepared, steps, value_fn, 0, True), inputs)
@@ -241,16 +257,19 @@ class InpaintingPlanner(nn.Module):
         action_history: th.Tensor,
         delay: th.Tensor,
         x: th.Tensor,
+        state_history: th.Tensor | None = None,
+        state_known: th.Tensor | None = None,
     ) -> Plan:
         """Go from what is known and initial noise to the decision, without waiting for the device on the way.
 
         :param shortest: a lower bound of the delays: no state before it is scored
         :param is_mixed: whether delays may differ, so that some windows end before others
         :param x: (B, N, L, obs_dim + act_dim) initial noise, scaled
+        :param state_history: (B, D, obs_dim), and which of it is known: ``state_known``, (B, D) bool
         """
         length = x.shape[2]
-        given = inpainting.known_window(observation, action_history, delay, length)
-        known = inpainting.known_mask(delay, length, self.obs_dim, self.act_dim)
+        given = inpainting.known_window(observation, action_history, delay, length, state_history)
+        known = inpainting.known_mask(delay, length, self.obs_dim, self.act_dim, state_known)
         clean = self.normalizer.normalize(*self._split(given))  # (B, L, obs_dim + act_dim), as given and known
         valid = self._within(delay, length).repeat_interleave(x.shape[1], 0) if is_mixed else None  # (B * N, L)
         network, modulations = prepared
@@ -324,6 +343,29 @@ class InpaintingPlanner(nn.Module):
                 "planner with a larger max_delay."
             )
         return delay.to(self.device, th.int64)
+
+    def _extra_states(
+        self, state_history: th.Tensor | None, state_known: th.Tensor | None, batch_size: int
+    ) -> tuple[th.Tensor, ...]:
+        """Return checked extra states, (B, D, obs_dim) and (B, D) bool, or nothing if the config has none."""
+        if (state_history is None) != (state_known is None):
+            raise ValueError("Only one of state_history and state_known is given; give both or neither.")
+        if self.config.extra_state_probability == 0:
+            if state_history is not None:
+                raise ValueError(
+                    "This planner is not trained with extra known states; build and train it with "
+                    "PlannerConfig(extra_state_probability=0.5), or leave state_history and state_known out."
+                )
+            return ()
+        shape = (batch_size, self.max_delay)
+        if state_history is None or state_known is None:  # zeros, so that a recorded graph always has these inputs
+            state_history, state_known = th.zeros(*shape, self.obs_dim), th.zeros(shape)
+        state_history, state_known = self._tensor(state_history), self._tensor(state_known)
+        _check("state_history", state_history, (*shape, self.obs_dim))
+        _check("state_known", state_known, shape)
+        if not ((state_known == 0) | (state_known == 1)).all():
+            raise ValueError("state_known has entries other than 0 and 1, expected 1 where a state is known.")
+        return state_history, state_known.bool()
 
 
 def _owner(value_fn: ValueFn) -> object:

@@ -98,7 +98,8 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
 
         :param observation: one observation or a batch of them
         :return: tensors with a batch dimension, and whether they had one before
-        :raises ValueError: for NaN or infinite entries, another shape, other keys, or an age outside 0..max_delay
+        :raises ValueError: for NaN or infinite entries, another shape, other keys, an age outside 0..max_delay, or a
+            ``state_known`` other than 0 and 1
         """
         space = self.observation_space
         if not isinstance(space, spaces.Dict):
@@ -119,7 +120,7 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         batches = {key: _check_array(key, values, space[key]) for key, values in arrays.items()}
         if len(set(batches.values())) > 1:
             raise ValueError(f"The parts of an observation differ in how many there are: {batches}.")
-        _check_delayed(arrays["delay"], arrays["action_history"], self.max_delay)
+        _check_delayed(arrays, self.max_delay)
         # SB3's own method cannot reshape an action history of no actions, that of max_delay 0.
         is_batch = batches["delay"] is not None
         tensors = {
@@ -151,8 +152,9 @@ def _check_array(name: str, values: np.ndarray, space: spaces.Space[Any]) -> int
     return None if values.shape == space.shape else len(values)
 
 
-def _check_delayed(delay: np.ndarray, action_history: np.ndarray, max_delay: int) -> None:
-    """Refuse ages and actions that no ``DelayedObservationWrapper`` of this ``max_delay`` hands out."""
+def _check_delayed(arrays: dict[str, np.ndarray], max_delay: int) -> None:
+    """Refuse ages, actions and flags that no ``DelayedObservationWrapper`` of this ``max_delay`` hands out."""
+    delay, action_history = arrays["delay"], arrays["action_history"]
     if np.any(delay != np.round(delay)) or np.any(delay < 0) or np.any(delay > max_delay):
         raise ValueError(
             f"delay runs from {delay.min():g} to {delay.max():g}, expected whole numbers in 0..{max_delay}: "
@@ -162,4 +164,10 @@ def _check_delayed(delay: np.ndarray, action_history: np.ndarray, max_delay: int
         raise ValueError(
             f"action_history has entries of size {np.abs(action_history).max():g}, expected actions scaled to [-1, 1], "
             "as DelayedObservationWrapper gives them."
+        )
+    known = arrays.get("state_known", np.zeros(0))
+    if np.any((known != 0) & (known != 1)):
+        raise ValueError(
+            f"state_known runs from {known.min():g} to {known.max():g}, expected 1 where a state of state_history is "
+            "known and 0 elsewhere."
         )

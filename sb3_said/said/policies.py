@@ -14,7 +14,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
-from sb3_said.common.buffers import UNDELAYED, check_spaces
+from sb3_said.common.buffers import UNDELAYED, check_spaces, has_state_history
 from sb3_said.common.registry import register_class
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.sac.policies import DelayedSACPolicy
@@ -30,7 +30,8 @@ class SAIDPolicy(DelayedSACPolicy):
 
     :param planner_kwargs: fields of :class:`~sb3_said.planner.PlannerConfig`
     :param policy_kwargs: of :class:`~sb3_said.sac.DelayedSACPolicy`
-    :raises ValueError: for an unknown planner setting, or a delayed task whose critics do not read the true state
+    :raises ValueError: for an unknown planner setting, a delayed task whose critics do not read the true state, or a
+        ``state_history`` that the planner is not trained to read
     """
 
     planner_updates: th.Tensor
@@ -58,6 +59,12 @@ class SAIDPolicy(DelayedSACPolicy):
         with th.random.fork_rng(devices=[]):  # the expert learns as it would without a planner
             self.planner = InpaintingPlanner(
                 state_space.shape[0], action_space.shape[0], max_delay, PlannerConfig(**self.planner_kwargs)
+            )
+        if has_state_history(observation_space) and self.planner.config.extra_state_probability == 0:
+            raise ValueError(
+                "Observations have a state_history, but the planner is not trained with extra known states; give "
+                "planner_kwargs={'extra_state_probability': 0.5}, or leave state_history=False in "
+                "DelayedObservationWrapper."
             )
         self.planner.requires_grad_(False)
         self.register_buffer("planner_updates", th.zeros(()))
@@ -107,7 +114,9 @@ class SAIDPolicy(DelayedSACPolicy):
 
     def _plan(self, observation: PyTorchObs, noise: th.Tensor | None = None) -> th.Tensor:
         """Return the decision of each row: (B, act_dim)."""
+        state_history = state_known = None
         if isinstance(observation, dict):
+            state_history, state_known = observation.get("state_history"), observation.get("state_known")
             states, history, delay = (observation[key] for key in ("observation", "action_history", "delay"))
             delay = delay[:, 0].long()
         else:
@@ -124,7 +133,16 @@ class SAIDPolicy(DelayedSACPolicy):
                     f"one amid an episode has age {int(delay[amid][0])}; train with mask='random' for several delays."
                 )
             delay = th.full_like(delay, self.max_delay)
-        return self.planner.plan(states, history, delay, value_fn=self.value, noise=noise).action
+        plan = self.planner.plan(
+            states,
+            history,
+            delay,
+            value_fn=self.value,
+            noise=noise,
+            state_history=state_history,
+            state_known=state_known,
+        )
+        return plan.action
 
     def _noise_of(self, row: PyTorchObs) -> th.Tensor:
         """Return noise that the observation alone decides: (N, L, obs_dim + act_dim).

@@ -14,6 +14,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import configure_logger
 
+from sb3_said.common.buffers import has_state_history
 from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.sac import DelayedSAC
@@ -40,7 +41,8 @@ class SAID(DelayedSAC):
     :param planner_train_freq: also train the planner every so many environment steps; the paper only at the end (None)
     :param planner_newest_fraction: train on the newest part of the buffer only (the paper's 20 % is 0.2)
     :param sac_kwargs: every other argument of :class:`~sb3_said.sac.DelayedSAC` and of SB3's ``SAC``
-    :raises ValueError: as ``DelayedSAC`` does, and for planner settings outside their range
+    :raises ValueError: as ``DelayedSAC`` does, for planner settings outside their range, and for a ``state_history``
+        in the observations that the planner is not trained to read or that ``VecNormalize`` leaves unscaled
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": SAIDPolicy, "MultiInputPolicy": SAIDPolicy}
@@ -72,6 +74,15 @@ class SAID(DelayedSAC):
         self._planner_settings: dict[str, Any] = {}  # every field of the config, for files: defaults may change
         self._planner_trained_at = 0  # num_timesteps of the last planner training
         super().__init__(policy, env, learning_rate, **sac_kwargs)
+
+    def _check_parts(self) -> None:
+        super()._check_parts()
+        vec_normalize = self.get_vec_normalize_env()
+        if has_state_history(self.observation_space) and vec_normalize is not None and vec_normalize.norm_obs:
+            raise ValueError(
+                "VecNormalize scales the observation and not the state_history, which must have the same units; use "
+                "VecNormalize(..., norm_obs=False), or leave state_history=False in DelayedObservationWrapper."
+            )
 
     def _policy_flags(self) -> dict[str, Any]:
         return {**super()._policy_flags(), "planner_kwargs": {**self._planner_settings, **(self.planner_kwargs or {})}}

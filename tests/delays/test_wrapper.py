@@ -144,6 +144,69 @@ def test_every_step_under_any_process(process, receiver, spare, seed):
             np.testing.assert_array_equal(info["undelayed_observation"], task.states[-1][-1])
 
 
+@settings(deadline=None)
+@given(processes(), st.sampled_from(sorted(RECEIVERS)), st.integers(0, 2), st.integers(0, 2**16))
+def test_every_state_that_was_handed_out_is_remembered(process, receiver, spare, seed):
+    tasks = [LoggedTask(length=25), LoggedTask(length=25)]
+    max_delay = process.max_delay + spare
+    plain, env = (
+        DelayedObservationWrapper(task, process, max_delay=max_delay, receiver=receiver, state_history=remembers)
+        for task, remembers in zip(tasks, (False, True), strict=True)
+    )
+    env.action_space.seed(seed)
+    for episode in range(2):
+        plain_obs, _ = plain.reset(seed=seed + episode)
+        obs, _ = env.reset(seed=seed + episode)
+        handed_out = set()
+        for t in range(26):
+            assert env.observation_space.contains(obs)
+            for key, value in plain_obs.items():
+                np.testing.assert_array_equal(obs[key], value)
+            age = int(obs["delay"].item())
+            handed_out.add(t - age)
+            known, states = np.zeros(max_delay, np.float32), np.zeros((max_delay, 3), np.float32)
+            for k in range(max_delay):
+                if t - max_delay + 1 + k in handed_out:
+                    known[k], states[k] = 1.0, tasks[1].states[-1][t - max_delay + 1 + k]
+            np.testing.assert_array_equal(obs["state_known"], known)
+            np.testing.assert_array_equal(obs["state_history"], states)
+            if receiver == "newest":
+                assert not known[max_delay - age :].any()  # none is younger than the observation
+            if t < 25:
+                action = env.action_space.sample()
+                plain_obs, obs = plain.step(action)[0], env.step(action)[0]
+
+
+def test_an_older_observation_that_follows_a_younger_one():
+    class Table:
+        max_delay = 3
+
+        def sample(self, rng):
+            return iter([1, 0, 2, 3, 3])
+
+    task = LoggedTask()
+    env = DelayedObservationWrapper(task, Table(), receiver="independent", state_history=True)
+    observations = [env.reset(seed=0)[0]] + [env.step(env.action_space.sample())[0] for _ in range(5)]
+    # Read at t = 0..5: s_0, s_0, s_2, s_1, s_1, s_2; known of s_{t-2}, s_{t-1}, s_t:
+    known = [[0, 0, 1], [0, 1, 0], [1, 0, 1], [1, 1, 0], [1, 0, 0], [0, 0, 0]]
+    assert [obs["state_known"].tolist() for obs in observations] == known
+    np.testing.assert_array_equal(observations[3]["state_history"][1], task.states[0][2])  # while s_1 is handed out
+    assert observations[3]["delay"] == 2
+    kept = observations[2]["state_history"].copy()
+    env.reset()
+    np.testing.assert_array_equal(observations[2]["state_history"], kept)
+
+
+def test_unknown_states_lie_in_a_space_that_leaves_out_zero():
+    task = LoggedTask()
+    task.observation_space = spaces.Box(np.float32([1, -3, -1]), np.float32([2, -2, 1]))
+    env = DelayedObservationWrapper(task, 2, state_history=True)
+    box = env.observation_space["state_history"]
+    np.testing.assert_array_equal(box.low, [[0, -3, -1]] * 2)
+    np.testing.assert_array_equal(box.high, [[2, 0, 1]] * 2)
+    assert env.observation_space["observation"] == task.observation_space
+
+
 def test_losses_that_were_delivered_are_counted():
     env = DelayedObservationWrapper(LoggedTask(length=100), DroppedPackets(1, p=1.0, max_losses=2))
     env.reset(seed=0)
@@ -221,16 +284,21 @@ def test_parallel_environments_draw_their_own_delays():
 @pytest.mark.parametrize("name", ["Pendulum-v1", "Hopper-v5"])
 @pytest.mark.filterwarnings("ignore::UserWarning")  # both recommend other bounds, of the tasks themselves
 def test_checkers_of_gymnasium_and_sb3(name, delay):
-    check_gymnasium_env(DelayedObservationWrapper(gym.make(name).unwrapped, delay), skip_render_check=True)
-    check_sb3_env(DelayedObservationWrapper(gym.make(name), delay), warn=False)
+    for kwargs in ({}, {"receiver": "independent", "state_history": True}):
+        env = DelayedObservationWrapper(gym.make(name).unwrapped, delay, **kwargs)
+        check_gymnasium_env(env, skip_render_check=True)
+        check_sb3_env(DelayedObservationWrapper(gym.make(name), delay, **kwargs), warn=False)
 
 
 def test_made_again_from_its_spec():
     env = gym.make(DelayedObservationWrapper(gym.make("Pendulum-v1"), (1, 3), max_delay=5).spec)
     assert isinstance(env, DelayedObservationWrapper)
     assert (env.process, env.max_delay) == (EpisodeDelay(1, 3), 5)
-    env = gym.make(DelayedObservationWrapper(gym.make("Pendulum-v1"), WIFI_20MS, receiver="independent").spec)
+    env = gym.make(
+        DelayedObservationWrapper(gym.make("Pendulum-v1"), WIFI_20MS, receiver="independent", state_history=True).spec
+    )
     assert (env.process, type(env.receiver)) == (WIFI_20MS, IndependentDraw)
+    assert "state_known" in env.reset()[0]
 
 
 def make_pendulum(delay):

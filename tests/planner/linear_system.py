@@ -32,8 +32,11 @@ def cost(state: th.Tensor, action: th.Tensor) -> th.Tensor:
     return (state @ Q * state).sum(-1) + (action @ R * action).sum(-1)
 
 
-def make_source(n_episodes: int = 400, length: int = 40, seed: int = 0) -> WindowSource:
-    """Return windows of the behaviour policy; values are the best cost-to-go, turned to [0, 1]."""
+def make_source(n_episodes: int = 400, length: int = 40, seed: int = 0, process_noise: float = 0.0) -> WindowSource:
+    """Return windows of the behaviour policy; values are the best cost-to-go, turned to [0, 1].
+
+    :param process_noise: standard deviation of what is added to each entry of every next state
+    """
     generator = th.Generator().manual_seed(seed)
     state = th.randn(n_episodes, STATE_DIM, generator=generator)
     states, actions = [], []
@@ -43,6 +46,8 @@ def make_source(n_episodes: int = 400, length: int = 40, seed: int = 0) -> Windo
         states.append(state)
         actions.append(action)
         state = next_state(state, action)
+        if process_noise > 0:
+            state = state + process_noise * th.randn(n_episodes, STATE_DIM, generator=generator)
     stacked = th.stack(states)  # (length, n_episodes, STATE_DIM): one row per step, one environment per episode
     value = -(stacked @ riccati()[1] * stacked).sum(-1).flatten()
     rows = th.arange(length).repeat_interleave(n_episodes)

@@ -97,6 +97,25 @@ def test_context_reads_known_entries_only():
     assert (network.context(x, known) - network.context(x, th.zeros_like(known))).abs().amax(2).min() > 1e-3
 
 
+def test_context_tells_every_token_of_extra_states():
+    network = make_network(extra_states=True)
+    x, known, _ = make_inputs()
+    known[:, DELAY, :OBS] = True
+    base = network.context(x, known)
+    assert th.equal(network.context(th.where(known, x, 9.0), known), base)
+    changed, fewer = x.clone(), known.clone()
+    changed[:, DELAY, 0] += 1.0
+    fewer[:, DELAY, :OBS] = False
+    for other in (network.context(changed, known), network.context(x.where(known, 0.0), fewer)):
+        assert ((other - base).abs().amax((0, 2)) > 1e-3).all()
+    zero = x.clone()  # a state that is known to be 0 is not an unknown one
+    zero[:, DELAY, :OBS] = 0.0
+    assert ((network.context(zero, known) - network.context(zero, fewer)).abs().amax((0, 2)) > 1e-3).all()
+    short = network.context(x[:, : DELAY - 1], known[:, : DELAY - 1])  # nothing is known behind a window's end
+    known[:, DELAY - 1 :] = False
+    th.testing.assert_close(network.context(x, known)[:, : DELAY - 1], short)
+
+
 def test_sharing_modulations_and_contexts_changes_nothing():
     network = make_network(depth=3)
     x, known, _ = make_inputs()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 import torch as th
 from linear_system import (
@@ -15,6 +17,7 @@ from linear_system import (
     riccati,
 )
 
+from sb3_said.common.windows import WindowSource
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner.trainer import PlannerTrainer
 
@@ -23,8 +26,7 @@ D = 3
 GRADIENT_STEPS = 800
 
 
-@pytest.fixture(scope="module")
-def trainer() -> PlannerTrainer:
+def train(source: WindowSource, **changes) -> PlannerTrainer:
     with th.random.fork_rng(devices=[]):
         th.manual_seed(0)
         config = PlannerConfig(
@@ -39,11 +41,17 @@ def trainer() -> PlannerTrainer:
             sampling_steps=5,
             mask="random",
             precision="float32",
+            **changes,
         )
         planner = InpaintingPlanner(STATE_DIM, ACTION_DIM, D, config)
-    trainer = PlannerTrainer(planner, make_source(), GRADIENT_STEPS)
+    trainer = PlannerTrainer(planner, source, GRADIENT_STEPS)
     trainer.train()
     return trainer
+
+
+@pytest.fixture(scope="module")
+def trainer() -> PlannerTrainer:
+    return train(make_source())
 
 
 def test_every_delay_s_present_is_decoded(trainer):
@@ -53,6 +61,29 @@ def test_every_delay_s_present_is_decoded(trainer):
         assert errors[f"planner/present_error_d{d}"] < 0.05
         assert errors[f"planner/present_error_d{d}"] < errors[f"planner/present_error_mlp_d{d}"] + 0.01
         assert errors[f"planner/action_error_d{d}"] < 1.05 * errors[f"planner/action_error_mlp_d{d}"]
+
+
+def test_the_present_s_error_falls_with_the_age_of_the_youngest_known_state():
+    """Of a noisy system the best guess starts from that state, and older ones add nothing to it."""
+    trainer = train(make_source(process_noise=0.2), extra_state_probability=0.5)
+    planner, (windows, delay) = trainer.planner, trainer._held_out
+    states, actions = windows.states[delay == D, : D + 1], windows.actions[delay == D, :D]
+    n, d = len(states), th.full((int((delay == D).sum()),), D)
+
+    def error(guess):
+        return ((guess - states[:, D]).abs() / planner.normalizer.state_std).mean().item()
+
+    best = [error(present(states[:, k], actions, d - k)) for k in range(D + 1)]  # from s_{t-D+k}
+    errors: list[list[float]] = [[] for _ in best]
+    for subset in itertools.product((0.0, 1.0), repeat=D):  # of s_{t-D+1..t}
+        extra = {"state_history": states[:, 1:], "state_known": th.tensor(subset).expand(n, D)}
+        plan = planner.plan(states[:, 0], actions, d, temperature=0.0, **extra)
+        youngest = max((k + 1 for k in range(D) if subset[k]), default=0)
+        errors[youngest].append(error(plan.states[:, 0, D]))
+    for k in range(D + 1):
+        assert 0.95 * best[k] <= min(errors[k]) <= max(errors[k]) <= best[k] + 0.05, (errors, best)
+        assert k == D or max(errors[k + 1]) < min(errors[k])
+    assert errors[D] == [0.0] * 4  # s_t itself
 
 
 def test_selection_by_value_approaches_the_best_plan(trainer):

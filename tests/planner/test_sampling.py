@@ -300,6 +300,25 @@ def test_a_decision_is_recorded_once_for_its_sizes_settings_and_weights(monkeypa
     assert len(planner._cache._graphs) == sampling.MAX_GRAPHS
 
 
+def make_extra(n=3, seed=0):
+    g = th.Generator().manual_seed(seed)
+    known = th.rand(n, DELAY, generator=g) < 0.5
+    return {"state_history": 3 + 2 * th.randn(n, DELAY, OBS, generator=g), "state_known": known}
+
+
+def test_a_recorded_decision_reads_the_extra_states_of_each_call(monkeypatch):
+    monkeypatch.setattr(sampling, "Graph", FakeGraph)
+    monkeypatch.setattr(FakeGraph, "made", 0)
+    planner, eager = (make_planner(extra_state_probability=0.5) for _ in range(2))
+    monkeypatch.setattr(planner, "_can_be_graphed", lambda value_fn: True)
+    answers = []
+    for extra in (make_extra(), make_extra(seed=1), {}, make_extra(seed=2)):
+        plans = [answer(p, value_fn=None, **extra) for p in (planner, eager)]
+        th.testing.assert_close(plans[0], plans[1])
+        answers.append(plans[0].states)
+    assert FakeGraph.made == 1 and not any(th.equal(answers[0], other) for other in answers[1:])
+
+
 def test_only_modules_on_a_gpu_are_recorded(monkeypatch):
     planner = make_planner()
     assert not planner._can_be_graphed(None)
@@ -313,12 +332,16 @@ def test_only_modules_on_a_gpu_are_recorded(monkeypatch):
 
 @pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
-def test_a_recorded_decision_is_the_eager_one(precision, monkeypatch):
-    planner, module = make_planner(precision=precision).cuda(), Value().cuda()
-    for inputs in (make_inputs(), make_inputs(seed=1), make_inputs(2)):
+@pytest.mark.parametrize("probability", [0.0, 0.5])
+def test_a_recorded_decision_is_the_eager_one(precision, probability, monkeypatch):
+    planner = make_planner(precision=precision, extra_state_probability=probability).cuda()
+    module = Value().cuda()
+    for inputs, extra in ((make_inputs(), make_extra()), (make_inputs(seed=1), {}), (make_inputs(2), make_extra(2))):
         inputs = [x.cuda() for x in inputs]
-        recorded = answer(planner, inputs, value_fn=module.score)
+        extra = extra if probability > 0 else {}
+        recorded = answer(planner, inputs, value_fn=module.score, **extra)
         with monkeypatch.context() as patch:
             patch.setattr(planner_module.InpaintingPlanner, "_can_be_graphed", lambda self, value_fn: False)
-            th.testing.assert_close(answer(planner, inputs, value_fn=module.score), recorded, atol=1e-4, rtol=1e-4)
+            eager = answer(planner, inputs, value_fn=module.score, **extra)
+            th.testing.assert_close(eager, recorded, atol=1e-4, rtol=1e-4)
     assert planner._cache._graphs

@@ -408,3 +408,14 @@ def test_training_resumes_under_other_sampling_settings():
     first.train(3)
     second.load_state_dict(first.state_dict())
     assert second.n_updates == 3
+
+
+def test_training_with_extra_states_resumes_bit_for_bit():
+    whole, first, second = (make_trainer(extra_state_probability=0.5) for _ in range(3))
+    whole.train()
+    first.train(5)
+    second.load_state_dict(first.state_dict())
+    second.train()
+    assert_same(second.state_dict(), whole.state_dict())
+    with pytest.raises(ValueError, match=r"extra_state_probability was 0\.5 and is now 0\.0"):
+        make_trainer().load_state_dict(first.state_dict())

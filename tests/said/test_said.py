@@ -18,7 +18,8 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_said import SAID, DelayedSAC, PlannerConfig
+from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC, PlannerConfig
+from sb3_said.delays import UniformDelay
 
 PLANNER = {"d_model": 32, "depth": 1, "horizon": 3, "batch_size": 16, "sampling_steps": 2, "n_candidates": 4}
 
@@ -531,3 +532,93 @@ def test_the_newest_part_of_the_buffer():
     assert trainer.source.rows.min() >= 80
     model.planner_newest_fraction = 1.0
     assert model.make_planner_trainer()._settings["n_windows"] == 100
+
+
+# ---------------------------------------------------------------------------------------------------- known states
+
+
+def remembering(state_history=True):
+    return DelayedObservationWrapper(Drift(), UniformDelay(0, 3), receiver="independent", state_history=state_history)
+
+
+@pytest.fixture(scope="module")
+def trained_with_extra_states():
+    return make(remembering(), planner_kwargs={"extra_state_probability": 0.5}).learn(80)
+
+
+def test_known_states_reach_the_planner_and_change_the_plan(trained_with_extra_states, monkeypatch):
+    model, batch, seen = trained_with_extra_states, observe(11, remembering()), []
+    younger = np.arange(3, 0, -1) <= batch["delay"]  # rows of states younger than the observation
+    has_extra = (batch["state_known"].astype(bool) & younger).any(1)
+    assert has_extra.any() and not has_extra.all()
+    plan = model.policy.planner.plan
+    monkeypatch.setattr(
+        model.policy.planner, "plan", lambda *args, **kwargs: seen.append((args, kwargs)) or plan(*args, **kwargs)
+    )
+    answer(model, batch, deterministic=False)
+    args, kwargs = seen[0]
+    for key in ("state_history", "state_known"):
+        np.testing.assert_array_equal(kwargs[key], batch[key])
+    forgetful = {key: value for key, value in kwargs.items() if key in ("value_fn", "noise")}
+    forgetful["noise"] = kwargs["noise"] = th.randn(4, 6, 3, generator=th.Generator().manual_seed(0))
+    plans = [plan(*args, **keywords).states for keywords in (kwargs, forgetful)]
+    assert np.array_equal([not th.equal(a, b) for a, b in zip(*plans, strict=True)], has_extra)
+
+
+def test_an_agent_with_extra_states_is_saved_and_repeats(trained_with_extra_states, tmp_path):
+    model, batch = trained_with_extra_states, observe(11, remembering())
+    model.save(tmp_path / "said")
+    model.save_replay_buffer(tmp_path / "replay")
+    loaded = SAID.load(tmp_path / "said", env=remembering(), device="cpu")
+    loaded.warmup(2)
+    expected = answer(model, batch)
+    assert np.array_equal(answer(loaded, batch), expected)
+    assert np.array_equal([answer(loaded, row) for row in rows_of(batch)], expected)
+    loaded.load_replay_buffer(tmp_path / "replay")
+    assert same_replay(loaded, model)
+    loaded.learn(20, reset_num_timesteps=False)
+    assert loaded.num_timesteps == 100
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        SAID.load(tmp_path / "said", env=remembering(state_history=False))
+
+
+def test_the_expert_does_not_read_extra_states(trained_with_extra_states):
+    sac, plain = (make(remembering(flag), cls=DelayedSAC).learn(80) for flag in (True, False))
+    assert same_replay(sac, plain) and same_replay(trained_with_extra_states, plain)
+    for name, value in plain.policy.state_dict().items():
+        assert th.equal(sac.policy.state_dict()[name], value), name
+    batch = observe(11, remembering())
+    others = {**batch, "state_history": batch["state_history"] + 1.0, "state_known": 1.0 - batch["state_known"]}
+    assert np.array_equal(answer(sac, batch), answer(sac, others))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("state_known", [0.0, 0.5, 1.0], "state_known runs from 0 to 1, expected 1 where"),
+        ("state_known", [0.0, 2.0, 1.0], "state_known runs from 0 to 2"),
+        ("state_known", [0.0, np.nan, 1.0], "state_known has entries that are NaN"),
+        ("state_known", [0.0, 1.0], r"state_known has the shape \(2,\)"),
+        ("state_history", np.full((3, 2), np.inf), "state_history has entries that are NaN or infinite"),
+        ("state_history", np.zeros((2, 2)), r"state_history has the shape \(2, 2\)"),
+        ("state_history", None, "got the keys"),
+    ],
+)
+def test_bad_extra_states_are_refused(trained_with_extra_states, key, value, message):
+    obs = rows_of(observe(5, remembering()))[4]
+    obs.pop(key)
+    if value is not None:
+        obs[key] = np.asarray(value, np.float32)
+    with pytest.raises(ValueError, match=message):
+        trained_with_extra_states.predict(obs)
+
+
+def test_extra_states_that_could_not_be_used_are_refused():
+    with pytest.raises(ValueError, match=r"planner_kwargs=\{'extra_state_probability': 0.5\}"):
+        make(remembering())
+    vec_env = VecNormalize(make_vec_env(remembering, n_envs=1), norm_obs_keys=["observation"])
+    with pytest.raises(ValueError, match=r"VecNormalize scales the observation .*norm_obs=False"):
+        make(vec_env, planner_kwargs={"extra_state_probability": 0.5})
+    vec_env = VecNormalize(make_vec_env(remembering, n_envs=1), norm_obs=False)
+    make(vec_env, planner_kwargs={"extra_state_probability": 0.5})
+    make(planner_kwargs={"extra_state_probability": 0.5})  # trained for later use
