@@ -68,7 +68,9 @@ def assert_windows(source, starts, length):
     np.testing.assert_array_equal(windows.valid, np.arange(length) < n_valid[:, None])
     spread = values.max() - values.min()
     scaled = (values - values.min()) / spread if spread > 0 else np.ones_like(values)
-    np.testing.assert_allclose(windows.values, scaled, atol=1e-5)
+    # Large values close together lose digits
+    rounding = np.finfo(np.float32).eps * np.abs(values).max() / spread if spread > 0 else 0.0
+    np.testing.assert_allclose(windows.values, scaled, atol=1e-5 + 4 * rounding)
     assert [x.dtype for x in windows] == [th.float32, th.float32, th.bool, th.float32]
 
 
