@@ -557,7 +557,12 @@ def test_every_network_call_sees_extra_states_clean_and_is_told():
     moves = (states[:, 1:] - states[:, :1]) / normalizer.state_std / normalizer.move_std[:DELAY]
     clean = th.cat([normalizer.normalize_states(observation)[:, None], moves], 1)
     planner.network.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
-    base = planner.plan(observation, history, delay, n_candidates=3, generator=seeded(), **extra)
+
+    def plan(state_history):
+        given = {**extra, "state_history": state_history}
+        return planner.plan(observation, history, delay, n_candidates=3, generator=seeded(), **given)
+
+    base = plan(extra["state_history"])
     assert len(seen) == SMALL.sampling_steps
     for x in seen:
         shown = x.unflatten(0, (4, 3))[:, :, : DELAY + 1, :OBS]
@@ -565,27 +570,9 @@ def test_every_network_call_sees_extra_states_clean_and_is_told():
             shown[known[:, None].expand(-1, 3, -1)], clean[:, None].expand_as(shown)[known[:, None].expand(-1, 3, -1)]
         )
     # What is not known has no influence; what is known has one on all that is not, and so has knowing it
-    other = extra["state_history"] + ~extra["state_known"][..., None]
-    again = planner.plan(
-        observation,
-        history,
-        delay,
-        n_candidates=3,
-        generator=seeded(),
-        state_history=other,
-        state_known=extra["state_known"],
-    )
+    again = plan(extra["state_history"] + ~extra["state_known"][..., None])
     assert th.equal(again.states, base.states)
-    other = extra["state_history"] + extra["state_known"][..., None]
-    again = planner.plan(
-        observation,
-        history,
-        delay,
-        n_candidates=3,
-        generator=seeded(),
-        state_history=other,
-        state_known=extra["state_known"],
-    )
+    again = plan(extra["state_history"] + extra["state_known"][..., None])
     assert (again.states[:, :, DELAY + 1 :] != base.states[:, :, DELAY + 1 :]).all(-1).all()
 
 
