@@ -25,6 +25,7 @@ class Plan(NamedTuple):
     """Candidate plans for B decisions, in environment units."""
 
     action: th.Tensor  # (B, act_dim), in [-1, 1]: the best candidate's action at the decision index
+    present: th.Tensor  # (B, obs_dim): s_t as the candidates decode it, their mean
     states: th.Tensor  # (B, N, L, obs_dim), L the largest delay of the decisions plus the horizon
     actions: th.Tensor  # (B, N, L, act_dim), in [-1, 1]
     values: th.Tensor  # (B, N), the scores the best was chosen by
@@ -284,20 +285,27 @@ class InpaintingPlanner(nn.Module):
         # What is given comes back exactly as given, without the rounding of the normaliser
         x = th.where(known[:, None], given[:, None], th.cat(self.normalizer.denormalize(x), dim=-1))
         states, actions = self._split(x)
-        values = self._values(states, actions, delay, value_fn, shortest)  # (B, N)
         rows = th.arange(len(x), device=x.device)
-        return Plan(actions[rows, values.argmax(1), delay], states, actions, values)
+        present = states[rows, :, delay].mean(1)  # (B, obs_dim)
+        values = self._values(states, actions, present, delay, value_fn, shortest)  # (B, N)
+        return Plan(actions[rows, values.argmax(1), delay], present, states, actions, values)
 
     def _values(
-        self, states: th.Tensor, actions: th.Tensor, delay: th.Tensor, value_fn: ValueFn | None, shortest: int
+        self,
+        states: th.Tensor,
+        actions: th.Tensor,
+        present: th.Tensor,
+        delay: th.Tensor,
+        value_fn: ValueFn | None,
+        shortest: int,
     ) -> th.Tensor:
         """Return the mean value of each candidate's scored states: (B, N)."""
         if value_fn is None:
             return th.zeros(states.shape[:2], device=self.device)
         if self.config.scored_states == "decision":
             rows = th.arange(len(delay), device=self.device)
-            present = states[rows, :, delay].mean(1, keepdim=True).expand(-1, states.shape[1], -1)  # (B, N, obs_dim)
-            states, actions = present[:, :, None], actions[rows, :, delay][:, :, None]  # windows of one step
+            states = present[:, None, None].expand(-1, states.shape[1], -1, -1)  # (B, N, 1, obs_dim)
+            actions = actions[rows, :, delay][:, :, None]  # windows of one step
             skipped, first = 0, th.zeros_like(delay)
         elif self.config.scored_states == "all":
             skipped, first = 1, th.ones_like(delay)

@@ -219,10 +219,9 @@ class PlannerTrainer:
         truth, guess = batch[3], self.yardstick(*batch[:3])
         history = self._action_history(windows.actions, delay)
         plan = self.planner.plan(windows.states[:, 0], history, delay, temperature=0.0, generator=th.Generator())
-        decoded = plan.states[th.arange(len(delay), device=self.device), 0, delay]
         metrics = {}
         for name, present in (
-            ("", Present(self.planner.normalizer.normalize_states(decoded), plan.action)),
+            ("", Present(self.planner.normalizer.normalize_states(plan.present), plan.action)),
             ("_mlp", Present(guess.state, guess.action.clamp(-1.0, 1.0))),
         ):
             state_error = (present.state - truth.state).abs().mean(1)  # (B,)

@@ -733,6 +733,7 @@ def test_the_decision_alone_is_scored_at_the_present_that_all_candidates_share()
     plan = planner.plan(observation, history, delay, value_fn=value_fn, generator=seeded())
     (states, actions), rows = seen[0], th.arange(6)
     present, decisions = plan.states[rows, :, delay].mean(1), plan.actions[rows, :, delay]  # (6, OBS), (6, 5, ACT)
+    th.testing.assert_close(plan.present, present)
     th.testing.assert_close(states, present[:, None, None].expand(6, 5, 1, OBS))
     th.testing.assert_close(actions, decisions[:, :, None])
     best = decisions[..., 0].argmax(1)  # the present is the same for all, so the actions decide
