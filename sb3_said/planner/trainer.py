@@ -17,7 +17,7 @@ from sb3_said.planner.inpainting import draw_delays
 from sb3_said.planner.planner import InpaintingPlanner
 from sb3_said.planner.yardstick import Present, RegressionYardstick
 
-HELD_OUT_WINDOWS = 256  # per delay, in evaluate()
+HELD_OUT_WINDOWS = 1024  # per delay, in evaluate(): tells errors that differ by 2 % apart
 YARDSTICK_LEARNING_RATE = 1e-3
 N_NORMALIZER_WINDOWS = 10_000  # enough for a standard deviation to a percent
 
@@ -340,8 +340,9 @@ def _plain(tree: Any) -> Any:
 
 
 def _flat(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings that decide the weights, in one dict."""
-    config = {key: value for key, value in settings["config"].items() if key not in SAMPLING_SETTINGS}
+    """Return the settings that decide the weights, in one dict; one that a file is older than has its default."""
+    config = _plain(dataclasses.asdict(PlannerConfig())) | settings["config"]
+    config = {key: value for key, value in config.items() if key not in SAMPLING_SETTINGS}
     return {**{key: value for key, value in settings.items() if key != "config"}, **config}
 
 

@@ -16,7 +16,7 @@ import torch as th
 from stable_baselines3.common.logger import Logger, make_output_format
 
 from sb3_said.common.save_util import load_tree, save_tree
-from sb3_said.planner import InpaintingPlanner
+from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.said.callbacks import PLANNER_CHECKPOINT_NAME, PlannerTrainingCallback
 from sb3_said.said.said import SAID
@@ -251,8 +251,9 @@ class DepthPlanners:
 
     def _load(self, depth: int) -> None:
         saved = load_tree(self.path(depth))
-        old, now = ({**x, **x["config"]} for x in (saved["settings"], self.training_settings(depth)))
-        if differing := [key for key in now if key != "config" and old.get(key) != now[key]]:
+        defaults = _plain(asdict(PlannerConfig()))  # what a setting counts as that a file is older than
+        old, now = ({**x, **defaults, **x["config"]} for x in (saved["settings"], self.training_settings(depth)))
+        if differing := [key for key in now if key not in ("config", *SAMPLING_SETTINGS) and old.get(key) != now[key]]:
             raise ValueError(
                 f"{self.path(depth)} is of another training: "
                 + "; ".join(f"{key} was {old.get(key)} and is now {now[key]}" for key in differing)

@@ -410,6 +410,18 @@ def test_training_resumes_under_other_sampling_settings():
     assert second.n_updates == 3
 
 
+def test_a_setting_that_a_file_is_older_than_counts_as_its_default():
+    first = make_trainer()
+    first.train(3)
+    old = first.state_dict()
+    del old["settings"]["config"]["extra_state_probability"]
+    second = make_trainer()
+    second.load_state_dict(old)
+    assert second.n_updates == 3
+    with pytest.raises(ValueError, match=r"extra_state_probability was 0\.0 and is now 0\.5"):
+        make_trainer(extra_state_probability=0.5).load_state_dict(old)
+
+
 def test_training_with_extra_states_resumes_bit_for_bit():
     whole, first, second = (make_trainer(extra_state_probability=0.5) for _ in range(3))
     whole.train()
