@@ -62,7 +62,7 @@ def make_agent(setting: Setting, device: str, precision: str = "auto") -> SAID:
     """Return an agent of random weights that answers with its planner."""
     env = DelayedObservationWrapper(gym.make(ENV), setting.delay)
     planner = {key: getattr(setting, key) for key in ("depth", "sampling_steps", "n_candidates", "d_model", "horizon")}
-    planner["precision"] = precision
+    planner |= {"precision": precision, "temperature": 0.5}  # at 0 there would be one candidate
     model = SAID("MultiInputPolicy", env, seed=0, buffer_size=1_000, device=device, planner_kwargs=planner)
     for layer in (model.policy.planner.network.modulation, model.policy.planner.network.out):
         th.nn.init.normal_(layer.weight, std=0.02)  # zero before training, so that nothing would be computed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import AbstractContextManager, nullcontext
 
 import torch as th
@@ -9,6 +10,8 @@ import torch as th
 from sb3_said.common.checks import check_choice
 
 PRECISIONS = ("auto", "float32", "bfloat16")
+#: Numbers in the activations, below which a CPU converts them for longer than bfloat16 saves in products
+SMALL = 48 * 128
 
 
 def has_bfloat16(device: th.device) -> bool:
@@ -23,15 +26,17 @@ def has_bfloat16(device: th.device) -> bool:
     return False
 
 
-def compute_dtype(precision: str, device: th.device) -> th.dtype:
+def compute_dtype(precision: str, device: th.device, size: float = math.inf) -> th.dtype:
     """Return the number format of the network's matrix products.
 
-    :param precision: ``"auto"`` (bfloat16 where :func:`has_bfloat16`), ``"float32"`` or ``"bfloat16"``
+    :param precision: ``"auto"`` (bfloat16 where :func:`has_bfloat16`, and on a CPU where it pays), ``"float32"`` or
+        ``"bfloat16"``
+    :param size: numbers in the activations, tokens times width
     :raises ValueError: for another name
     """
     check_choice("precision", precision, PRECISIONS)
-    is_half = precision == "bfloat16" or (precision == "auto" and has_bfloat16(device))
-    return th.bfloat16 if is_half else th.float32
+    pays = has_bfloat16(device) and (device.type != "cpu" or size >= SMALL)
+    return th.bfloat16 if precision == "bfloat16" or (precision == "auto" and pays) else th.float32
 
 
 def autocast(precision: str, device: th.device) -> AbstractContextManager[object]:

@@ -47,7 +47,9 @@ class PlannerConfig:
     time_grid: str = "uniform"  # DV; or "log_snr"
     sampling_steps: int = 5  # 99.6 % of the paper's return with 20
     n_candidates: int = 16  # measured; the paper's 50 cost three times as much
-    temperature: float = 0.5  # measured; factor on the initial noise, >= 0; the paper tunes 0.1 to 1 per task
+    # Factor on the initial noise, >= 0; at 0 one candidate is drawn and nothing chosen. Measured (results/README.md):
+    # choosing by the critics, which the expert's actor has already followed, led to falls; the paper tunes 0.1 to 1
+    temperature: float = 0.0
     # "future": states after the decision index (measured); "decision": the decision alone, at the present that the
     # candidates agree on, so that only actions compete and not beliefs; "all": all states but the first (paper)
     scored_states: str = "future"

@@ -220,7 +220,6 @@ class InpaintingPlanner(nn.Module):
             raise ValueError(
                 f"n_candidates is {n_candidates} and temperature {temperature}, expected at least 1 and at least 0."
             )
-        n_candidates = n_candidates if temperature > 0 else 1
         steps = diffusion.solver_steps(
             config.solver,
             config.schedule,
@@ -228,10 +227,14 @@ class InpaintingPlanner(nn.Module):
             config.time_grid,
         )
 
-        if noise is None:
-            noise = self._noise((n, n_candidates, *shape), generator)
-        x = temperature * noise[..., :n_candidates, :, :].expand(n, -1, -1, -1)  # (B, N, L, obs_dim + act_dim)
-        prepared = self._cache.prepare(self, self.network, steps, compute_dtype(config.precision, self.device))
+        if temperature == 0:
+            x = th.zeros(n, 1, *shape, device=self.device)
+        else:
+            noise = self._noise((n, n_candidates, *shape), generator) if noise is None else noise
+            x = temperature * noise.expand(n, -1, -1, -1)  # (B, N, L, obs_dim + act_dim)
+        n_tokens = x.shape[0] * x.shape[1] * self.window_length  # of the largest age, so that all have one format
+        dtype = compute_dtype(config.precision, self.device, n_tokens * config.d_model)
+        prepared = self._cache.prepare(self, self.network, steps, dtype)
         inputs = (observation, action_history, delay, x, *extra_states)
         if self._can_be_graphed(value_fn):
             key = (config, tuple(x.shape), value_fn, addresses(self if value_fn is None else _owner(value_fn)))

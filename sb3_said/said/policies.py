@@ -110,10 +110,13 @@ class SAIDPolicy(DelayedSACPolicy):
         # Each row alone: matrix products of another batch size round differently, and can change the candidate chosen.
         if who == "expert":
             return th.cat([super(SAIDPolicy, self)._predict(row, True) for row in _rows(observation)])
-        return th.cat([self._plan(row, self._noise_of(row)) for row in _rows(observation)])
+        return th.cat([self._plan(row, repeats=True) for row in _rows(observation)])
 
-    def _plan(self, observation: PyTorchObs, noise: th.Tensor | None = None) -> th.Tensor:
-        """Return the decision of each row: (B, act_dim)."""
+    def _plan(self, observation: PyTorchObs, repeats: bool = False) -> th.Tensor:
+        """Return the decision of each row: (B, act_dim).
+
+        :param repeats: let the observation, of one row, decide the noise
+        """
         state_history = state_known = None
         if isinstance(observation, dict):
             state_history, state_known = observation.get("state_history"), observation.get("state_known")
@@ -133,12 +136,13 @@ class SAIDPolicy(DelayedSACPolicy):
                     f"one amid an episode has age {int(delay[amid][0])}; train with mask='random' for several delays."
                 )
             delay = th.full_like(delay, self.max_delay)
+        chooses = self.planner.config.temperature > 0  # else there is no noise and one candidate
         plan = self.planner.plan(
             states,
             history,
             delay,
-            value_fn=self.value,
-            noise=noise,
+            value_fn=self.value if chooses else None,
+            noise=self._noise_of(observation) if chooses and repeats else None,
             state_history=state_history,
             state_known=state_known,
         )

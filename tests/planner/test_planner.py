@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 
 import numpy as np
 import pytest
@@ -17,7 +18,9 @@ from sb3_said.planner.diffusion import alpha_sigma, draw_times
 from sb3_said.planner.normalizer import Normalizer
 
 OBS, ACT, DELAY = 3, 2, 4
-SMALL = PlannerConfig(depth=2, d_model=32, horizon=4, precision="float32", sampling_steps=3, n_candidates=5)
+SMALL = PlannerConfig(
+    depth=2, d_model=32, horizon=4, precision="float32", sampling_steps=3, n_candidates=5, temperature=0.5
+)
 LENGTH = DELAY + SMALL.horizon
 
 
@@ -297,8 +300,23 @@ def test_autocast_follows_the_precision():
     auto = th.bfloat16 if precision.has_bfloat16(cpu) else th.float32
     assert seen == {"float32": th.float32, "bfloat16": th.bfloat16, "auto": auto}
     assert not precision.has_bfloat16(th.device("mps"))
+    assert precision.compute_dtype("auto", cpu, precision.SMALL) == auto
+    assert precision.compute_dtype("auto", cpu, precision.SMALL - 1) == th.float32
+    assert precision.compute_dtype("bfloat16", cpu, 1) == th.bfloat16
     with pytest.raises(ValueError, match="precision is 'half'"):
         precision.autocast("half", cpu)
+
+
+def test_a_small_decision_is_made_in_float32_at_every_age(monkeypatch):
+    monkeypatch.setattr(precision, "has_bfloat16", lambda device: True)
+    planner, reference = make_planner(precision="auto"), make_planner(precision="float32")
+    n_large = math.ceil(precision.SMALL / (LENGTH * SMALL.d_model))
+    for n, is_small in ((1, True), (n_large - 1, True), (n_large, False)):
+        batch = make_batch(n)
+        for delay in (0, DELAY):
+            ages = th.full((n,), delay)
+            plans = [p.plan(*batch[:2], ages, temperature=0.0).action for p in (planner, reference)]
+            assert th.equal(*plans) == is_small
 
 
 # --- plan ------------------------------------------------------------------------------------------------------------

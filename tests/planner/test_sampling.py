@@ -15,7 +15,9 @@ from sb3_said.planner import planner as planner_module
 from sb3_said.planner.diffusion import END_TIMES, START_TIME
 
 OBS, ACT, DELAY, N = 4, 2, 3, 8
-CONFIG = PlannerConfig(depth=2, d_model=64, horizon=4, sampling_steps=4, n_candidates=N, precision="float32")
+CONFIG = PlannerConfig(
+    depth=2, d_model=64, horizon=4, sampling_steps=4, n_candidates=N, temperature=0.5, precision="float32"
+)
 LENGTH = DELAY + CONFIG.horizon
 
 

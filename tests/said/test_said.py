@@ -21,7 +21,15 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC, PlannerConfig
 from sb3_said.delays import UniformDelay
 
-PLANNER = {"d_model": 32, "depth": 1, "horizon": 3, "batch_size": 16, "sampling_steps": 2, "n_candidates": 4}
+PLANNER = {
+    "d_model": 32,
+    "depth": 1,
+    "horizon": 3,
+    "batch_size": 16,
+    "sampling_steps": 2,
+    "n_candidates": 4,
+    "temperature": 0.5,
+}
 
 
 def make(env=None, cls=SAID, policy="MlpPolicy", planner_kwargs=(), **kwargs):
@@ -158,6 +166,20 @@ def test_the_candidate_of_the_highest_value_after_the_decision_answers(trained, 
     np.testing.assert_allclose(answer(trained, obs), 2.0 * chosen, rtol=1e-6, atol=1e-6)  # actions run from -2 to 2
 
 
+def test_at_temperature_0_nothing_is_drawn_and_no_critic_asked(saved, monkeypatch):
+    model, batch = SAID.load(saved, device="cpu"), observe()
+    model.set_planner(temperature=0.0)
+    monkeypatch.setattr(model.policy.critic, "q_values", None)
+    before = th.get_rng_state()
+    for deterministic in (True, False):
+        obs = {key: th.as_tensor(value) for key, value in batch.items()}
+        plan = model.policy.planner.plan(
+            obs["observation"], obs["action_history"], obs["delay"][:, 0].long(), temperature=0.0
+        )
+        np.testing.assert_allclose(answer(model, batch, deterministic), 2.0 * plan.action, rtol=1e-5, atol=1e-6)
+    assert th.equal(th.get_rng_state(), before)
+
+
 def test_deterministic_noise_is_the_observations_own(trained):
     # One noise for every observation makes the same candidates win at every step: on Hopper-v5 an agent of return 3,000
     # fell to 351 with it.
@@ -193,9 +215,9 @@ def test_deterministic_answers_are_made_row_by_row(trained, monkeypatch, who):
     owner, method = (trained.policy, "_plan") if who == "planner" else (trained.policy.actor, "forward")
     asked, original = [], getattr(owner, method)
 
-    def ask(observation, *args):
+    def ask(observation, *args, **kwargs):
         asked.append(len(observation["delay"]))
-        return original(observation, *args)
+        return original(observation, *args, **kwargs)
 
     monkeypatch.setattr(owner, method, ask)
     with trained.policy.answering(who):
