@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -93,9 +94,12 @@ def matmul_rates(device: str | th.device = "cpu") -> dict[str, float]:
     return {dtype: matmul_rate(dtype, device) for dtype in DTYPES}
 
 
-def dtype_name(precision: str, device: str | th.device) -> str:
-    """Return the number format that a ``precision`` of ours stands for on a device, as :func:`matmul_rate` takes it."""
-    dtype = compute_dtype(precision, th.device(device))
+def dtype_name(precision: str, device: str | th.device, size: float = math.inf) -> str:
+    """Return the number format that a ``precision`` of ours stands for on a device, as :func:`matmul_rate` takes it.
+
+    :param size: as :func:`~sb3_said.common.precision.compute_dtype` takes it
+    """
+    dtype = compute_dtype(precision, th.device(device), size)
     return next(name for name, other in DTYPES.items() if other == dtype)
 
 

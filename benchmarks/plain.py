@@ -223,6 +223,8 @@ class PlainPlanner:
     ) -> np.ndarray:
         """Return the best candidate's action, by the mean of min Q over the states after the decision: (B, act_dim).
 
+        One candidate is not scored.
+
         :param observation: (B, obs_dim) delayed observations
         :param action_history: (B, d, act_dim) actions sent since, oldest first
         :param critic: scores (state, action) pairs of the plan
@@ -236,6 +238,8 @@ class PlainPlanner:
         x = self.sample(prior, sampling_steps, temperature).view(n, n_candidates, length, -1)
         std, mean = th.tensor(self.state_std, device=self.device), th.tensor(self.state_mean, device=self.device)
         states, actions = x[..., : self.obs_dim] * std + mean, x[..., self.obs_dim :].clamp(-1, 1)
+        if n_candidates == 1:
+            return actions[:, 0, self.delay].cpu().numpy()
         future = slice(self.delay + 1, None)
         values = th.cat(critic(states[:, :, future].flatten(0, 2), actions[:, :, future].flatten(0, 2)), dim=1)
         best = values.min(1).values.view(n, n_candidates, -1).mean(-1).argmax(1)

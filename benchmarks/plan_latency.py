@@ -49,10 +49,16 @@ class Setting(NamedTuple):
     horizon: int = 8
     delay: int = 8
 
+    @property
+    def temperature(self) -> float:
+        """0, the default, where there is one candidate; then no critic is asked."""
+        return 0.5 if self.n_candidates > 1 else 0.0
+
 
 SETTINGS = (
     Setting("paper", 8, 20, 50, rounds=20),
     Setting("real time", 2, 5, 16, rounds=300),
+    Setting("--preset cpu, at the default temperature 0", 2, 5, 1, rounds=300, d_model=128),
     Setting("real time, the width of --preset cpu", 2, 5, 16, rounds=300, d_model=128),
 )
 QUICK = Setting("quick", 1, 2, 4, rounds=3, d_model=32, horizon=2, delay=2)
@@ -62,7 +68,7 @@ def make_agent(setting: Setting, device: str, precision: str = "auto") -> SAID:
     """Return an agent of random weights that answers with its planner."""
     env = DelayedObservationWrapper(gym.make(ENV), setting.delay)
     planner = {key: getattr(setting, key) for key in ("depth", "sampling_steps", "n_candidates", "d_model", "horizon")}
-    planner |= {"precision": precision, "temperature": 0.5}  # at 0 there would be one candidate
+    planner |= {"precision": precision, "temperature": setting.temperature}
     model = SAID("MultiInputPolicy", env, seed=0, buffer_size=1_000, device=device, planner_kwargs=planner)
     for layer in (model.policy.planner.network.modulation, model.policy.planner.network.out):
         th.nn.init.normal_(layer.weight, std=0.02)  # zero before training, so that nothing would be computed
@@ -79,7 +85,12 @@ def make_plain(setting: Setting, device: str, action: gym.Space[Any], observatio
 
     def decide(obs: dict[str, np.ndarray]) -> np.ndarray:
         return planner.decide(
-            obs["observation"][None], obs["action_history"][None], critic, setting.sampling_steps, setting.n_candidates
+            obs["observation"][None],
+            obs["action_history"][None],
+            critic,
+            setting.sampling_steps,
+            setting.n_candidates,
+            setting.temperature,
         )
 
     decide.planner = planner  # type: ignore[attr-defined]
@@ -101,7 +112,7 @@ def matmul_flops(setting: Setting, obs_dim: int, act_dim: int) -> int:
     weights = d * (3 * d + d + 4 * d + 4 * d)  # query, key and value; output of the attention; MLP
     attention = 2 * length * d  # a token's scores, and the mean of values
     per_token = setting.depth * (weights + attention) + 2 * d * (obs_dim + act_dim)
-    scored = n * (setting.horizon - 1)  # the states behind the decision
+    scored = n * (setting.horizon - 1) if n > 1 else 0  # the states behind the decision
     critics = N_CRITICS * ((obs_dim + act_dim) * HIDDEN + HIDDEN * HIDDEN + HIDDEN)
     return 2 * (setting.sampling_steps * n * length * per_token + scored * critics)
 
@@ -113,7 +124,8 @@ def measure_setting(setting: Setting, rounds: int, device: str) -> dict[str, Any
     obs = observe(env, setting.delay)
     spaces = env.observation_space["observation"], env.action_space
     plain = make_plain(setting, device, spaces[1], spaces[0])
-    dtype = dtype_name(model.policy.planner.config.precision, model.device)
+    size = setting.n_candidates * (setting.delay + setting.horizon) * setting.d_model
+    dtype = dtype_name(model.policy.planner.config.precision, model.device, size)
     rate = matmul_rate(dtype, device)
 
     model.warmup()
@@ -125,7 +137,7 @@ def measure_setting(setting: Setting, rounds: int, device: str) -> dict[str, Any
     )
     ours = percentiles(np.append(seconds["ours"], first))
     flops = matmul_flops(setting, spaces[0].shape[0], spaces[1].shape[0])
-    work = f"{setting.sampling_steps} steps, {setting.n_candidates} candidates"
+    work = f"{setting.sampling_steps} steps, {setting.n_candidates} candidate{'s' if setting.n_candidates > 1 else ''}"
     return {
         "setting": f"{setting.name}: depth {setting.depth}, width {setting.d_model}, {work}",
         "ours p50 ms": ours["p50_ms"],

@@ -18,18 +18,20 @@ def counted(function):
     return {name: sum(flops.values()) for name, flops in counter.get_flop_counts().items()}
 
 
-def test_both_ways_do_the_work_that_is_counted_from_shapes():
-    model = plan_latency.make_agent(SETTING, "cpu", precision="float32")
+@pytest.mark.parametrize("n_candidates", [1, 4])
+def test_both_ways_do_the_work_that_is_counted_from_shapes(n_candidates):
+    setting = SETTING._replace(n_candidates=n_candidates)
+    model = plan_latency.make_agent(setting, "cpu", precision="float32")
     env = model.get_env().envs[0]
-    obs = plan_latency.observe(env, SETTING.delay)
-    assert obs["delay"] == SETTING.delay
-    plain = plan_latency.make_plain(SETTING, "cpu", env.action_space, env.observation_space["observation"])
-    flops = plan_latency.matmul_flops(SETTING, OBS, ACT)
+    obs = plan_latency.observe(env, setting.delay)
+    assert obs["delay"] == setting.delay
+    plain = plan_latency.make_plain(setting, "cpu", env.action_space, env.observation_space["observation"])
+    flops = plan_latency.matmul_flops(setting, OBS, ACT)
 
     model.warmup()
     ours = counted(lambda: model.predict(obs, deterministic=True))
-    d_model, known = SETTING.d_model, OBS + SETTING.delay * (ACT + 1)
-    length = SETTING.delay + SETTING.horizon
+    d_model, known = setting.d_model, OBS + setting.delay * (ACT + 1)
+    length = setting.delay + setting.horizon
     context = 2 * (known * d_model + d_model * d_model + length * 2 * d_model)  # once a decision
     assert ours["Global"] == flops + context
 
