@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 from sb3_said.common import precision
 from sb3_said.common.checks import check_choice
@@ -98,6 +99,10 @@ class PlannerConfig:
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected a number in [0, 1].")
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return every setting in JSON types, as it comes back from a file: a tuple is a list."""
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
+
     @classmethod
     def paper(cls, depth: int = 8, temperature: float = 0.6, **changes: object) -> PlannerConfig:
         """Return the paper's settings; depth and temperature are the two it tunes per task.
@@ -126,3 +131,14 @@ class PlannerConfig:
             precision="float32",
         )
         return replace(config, **changes)  # type: ignore[arg-type]
+
+
+def weight_settings(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings of a training that decide the weights, in one dict; one that a file is older than has its
+    default.
+
+    :param settings: any, and under ``"config"`` those of :meth:`PlannerConfig.to_dict` that were known then
+    """
+    config = {**PlannerConfig().to_dict(), **settings["config"]}
+    config = {key: value for key, value in config.items() if key not in SAMPLING_SETTINGS}
+    return {**{key: value for key, value in settings.items() if key != "config"}, **config}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any
@@ -12,7 +11,7 @@ import torch as th
 
 from sb3_said.common.windows import Windows, WindowSource
 from sb3_said.planner.capture import CapturedStep
-from sb3_said.planner.config import SAMPLING_SETTINGS, PlannerConfig
+from sb3_said.planner.config import PlannerConfig, weight_settings
 from sb3_said.planner.inpainting import draw_delays
 from sb3_said.planner.planner import InpaintingPlanner
 from sb3_said.planner.yardstick import Present, RegressionYardstick
@@ -93,15 +92,13 @@ class PlannerTrainer:
         self.device = planner.device
         on_gpu = self.device.type == "cuda"
         self.generator = th.Generator(self.device if on_gpu else "cpu").manual_seed(seed)
-        self._settings = _plain(
-            {
-                "config": dataclasses.asdict(planner.config),
-                "gradient_steps": gradient_steps,
-                "held_out": held_out,
-                "seed": seed,
-                "n_windows": len(source),
-            }
-        )
+        self._settings = {
+            "config": planner.config.to_dict(),
+            "gradient_steps": gradient_steps,
+            "held_out": held_out,
+            "seed": seed,
+            "n_windows": len(source),
+        }
 
         training_source, held_source = source.split(held_out, seed) if held_out > 0 else (source, None)
         self.source = training_source.to(self.device)
@@ -218,7 +215,7 @@ class PlannerTrainer:
         batch = self._yardstick_batch(windows, delay)
         truth, guess = batch[3], self.yardstick(*batch[:3])
         history = self._action_history(windows.actions, delay)
-        plan = self.planner.plan(windows.states[:, 0], history, delay, temperature=0.0, generator=th.Generator())
+        plan = self.planner.plan(windows.states[:, 0], history, delay, temperature=0.0)
         metrics = {}
         for name, present in (
             ("", Present(self.planner.normalizer.normalize_states(plan.present), plan.action)),
@@ -254,7 +251,7 @@ class PlannerTrainer:
 
         :raises ValueError: when that training had other settings, so that the end would be neither's
         """
-        saved, given = _flat(state["settings"]), _flat(self._settings)
+        saved, given = weight_settings(state["settings"]), weight_settings(self._settings)
         if saved != given:
             differing = [key for key in sorted(saved | given) if saved.get(key) != given.get(key)]
             raise ValueError(
@@ -330,20 +327,6 @@ class PlannerTrainer:
             self._to_device(source.gather(th.cat(starts), self.planner.window_length)),
             th.cat(delays).to(self.device),
         )
-
-
-def _plain(tree: Any) -> Any:
-    """Turn tuples into lists, so that settings compare equal after a trip through JSON."""
-    if isinstance(tree, dict):
-        return {key: _plain(value) for key, value in tree.items()}
-    return [_plain(value) for value in tree] if isinstance(tree, (list, tuple)) else tree
-
-
-def _flat(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings that decide the weights, in one dict; one that a file is older than has its default."""
-    config = _plain(dataclasses.asdict(PlannerConfig())) | settings["config"]
-    config = {key: value for key, value in config.items() if key not in SAMPLING_SETTINGS}
-    return {**{key: value for key, value in settings.items() if key != "config"}, **config}
 
 
 def _optimizer_state(optimizer: th.optim.Optimizer) -> dict[str, Any]:

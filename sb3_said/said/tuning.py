@@ -8,7 +8,7 @@ import socket
 import threading
 import time
 import uuid
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,8 @@ import torch as th
 from stable_baselines3.common.logger import Logger, make_output_format
 
 from sb3_said.common.save_util import load_tree, save_tree
-from sb3_said.planner import InpaintingPlanner, PlannerConfig
-from sb3_said.planner.config import SAMPLING_SETTINGS
+from sb3_said.planner import InpaintingPlanner
+from sb3_said.planner.config import SAMPLING_SETTINGS, weight_settings
 from sb3_said.said.callbacks import PLANNER_CHECKPOINT_NAME, PlannerTrainingCallback
 from sb3_said.said.said import SAID
 
@@ -180,13 +180,13 @@ class DepthPlanners:
 
     def training_settings(self, depth: int) -> dict[str, Any]:
         """Return what decides a depth's weights, in JSON types: how the planner answers does not."""
-        model, config = self.model, asdict(replace(self.config, depth=depth))
+        model, config = self.model, replace(self.config, depth=depth).to_dict()
         return {
             "gradient_steps": self.gradient_steps,
             "newest_fraction": model.planner_newest_fraction,
             "training_seed": model.seed or 0,
             "trained_steps": model.num_timesteps,
-            "config": {key: value for key, value in _plain(config).items() if key not in SAMPLING_SETTINGS},
+            "config": {key: value for key, value in config.items() if key not in SAMPLING_SETTINGS},
         }
 
     def trial_settings(self) -> dict[str, Any]:
@@ -194,7 +194,7 @@ class DepthPlanners:
 
         How the planner answers is part of it: more candidates, for one, earn other returns with the same weights.
         """
-        config = {key: value for key, value in _plain(asdict(self.config)).items() if key not in TRIED_SETTINGS}
+        config = {key: value for key, value in self.config.to_dict().items() if key not in TRIED_SETTINGS}
         return {**self.training_settings(self.config.depth), "config": config}
 
     def _replace_planner(self, depth: int) -> None:
@@ -251,9 +251,8 @@ class DepthPlanners:
 
     def _load(self, depth: int) -> None:
         saved = load_tree(self.path(depth))
-        defaults = _plain(asdict(PlannerConfig()))  # what a setting counts as that a file is older than
-        old, now = ({**x, **defaults, **x["config"]} for x in (saved["settings"], self.training_settings(depth)))
-        if differing := [key for key in now if key not in ("config", *SAMPLING_SETTINGS) and old.get(key) != now[key]]:
+        old, now = weight_settings(saved["settings"]), weight_settings(self.training_settings(depth))
+        if differing := [key for key in now if old.get(key) != now[key]]:
             raise ValueError(
                 f"{self.path(depth)} is of another training: "
                 + "; ".join(f"{key} was {old.get(key)} and is now {now[key]}" for key in differing)
@@ -262,11 +261,6 @@ class DepthPlanners:
         policy = self.model.policy
         policy.planner.load_state_dict(saved["planner"])
         policy.planner_updates.fill_(float(self.gradient_steps))
-
-
-def _plain(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return settings as they come back from JSON, which knows no tuples."""
-    return dict(json.loads(json.dumps(settings)))
 
 
 def _read(path: Path) -> str | None:
