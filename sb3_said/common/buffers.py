@@ -18,6 +18,8 @@ from sb3_said.common.windows import Windows, WindowSource
 
 #: Key of the true state in ``info`` and in sampled observations; never part of an environment's observation space.
 UNDELAYED = "undelayed_observation"
+#: Key in ``info`` of what the task was given, where that is not the action sent last.
+EXECUTED = "executed_action"
 _ROW_ARRAYS = ("observations", "actions", "rewards", "dones", "timeouts", "ages", "steps", "tail_slots")
 
 
@@ -31,7 +33,9 @@ class DelayedReplayBuffer(ReplayBuffer):
     observations have the extra key ``undelayed_observation``, the true state, for a delay-reconciled critic, and no
     ``state_history``, which neither actor nor critics read.
 
-    The stored action is the one that ``action_history`` says was executed, so that it agrees with the histories.
+    The stored action is the one that was executed, as ``action_history`` says, or ``info["executed_action"]`` where each
+    action takes a time of its own to the actuator. The critics' transitions are the task's own there, too; rebuilt
+    histories hold what was executed instead of what was sent, which differs while delays change.
 
     :param buffer_size: transitions over all environments
     :param observation_space: that of ``DelayedObservationWrapper``, or a 1-D Box (delay 0)
@@ -122,8 +126,9 @@ class DelayedReplayBuffer(ReplayBuffer):
         self.observations[row] = np.where(continues[:, None], self._next_states, obs["observation"])
         self.steps[row] = np.where(continues, self.steps[previous] + 1, 0)
         self.ages[row] = obs["delay"].reshape(self.n_envs) if self.is_delayed else 0
-        executed = next_obs["action_history"][:, -1] if self.max_delay > 0 else action
-        self.actions[row] = executed.reshape(self.n_envs, self.action_dim)
+        sent = next_obs["action_history"][:, -1] if self.max_delay > 0 else action
+        sent = sent.reshape(self.n_envs, self.action_dim)
+        self.actions[row] = np.stack([info.get(EXECUTED, newest) for info, newest in zip(infos, sent, strict=True)])
         self.rewards[row] = reward
         self.dones[row] = done
         if self.handle_timeout_termination:

@@ -118,13 +118,14 @@ class DroppedPackets:
 
 @dataclass(frozen=True)
 class TotalDelay:
-    """Observation delay plus action delay.
+    """Observation delay plus action delay: ``delay`` and ``action_delay`` of the wrapper in one, as on a command line.
 
     An action that takes k steps to the actuator meets the state k steps on. Seen from the actuator, the action is
-    executed as it is chosen, and observations are k steps older: which of the two is delayed makes no difference.
+    executed as it is chosen, and observations are k steps older: which of the two is delayed makes no difference, as
+    long as all actions of an episode take equally long.
 
     :param observation: delays of observations
-    :param action: delay of actions, one for all of an episode
+    :param action: delays of actions
     """
 
     observation: int | tuple[int, int] | DelayProcess
@@ -137,6 +138,11 @@ class TotalDelay:
     def max_delay(self) -> int:
         return make_process(self.observation).max_delay + make_process(self.action).max_delay
 
+    @property
+    def action_varies(self) -> bool:
+        """Whether every action takes a time of its own, which only the wrapper can act out."""
+        return isinstance(make_process(self.action).sample(np.random.default_rng(0)), Iterator)
+
     def sample(self, rng: np.random.Generator) -> Iterator[int | None]:
         """Draw the observation delays from ``rng``, as they are without action delay, the action delay from a child.
 
@@ -146,9 +152,8 @@ class TotalDelay:
         added = action.sample(rng.spawn(1)[0])
         if isinstance(added, Iterator):
             raise ValueError(
-                f"{action} draws a delay for every packet, but an action delay is one number for all actions of an "
-                f"episode; let the actuator hold each action until {action.max_delay} steps after it was chosen, and "
-                f"write action_delay={action.max_delay}."
+                f"{action} draws a delay for every action, which is more than an age of observations can tell; give "
+                "TotalDelay to DelayedObservationWrapper as it is, not inside another process."
             )
         k = check_draw(added, action, action.max_delay)
         return (None if delay is None else delay + k for delay in packet_delays(observation, rng))

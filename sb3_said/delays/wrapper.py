@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_said.delays.actuator import Actuator
 from sb3_said.delays.combined import TotalDelay
 from sb3_said.delays.processes import DelayProcess, make_process
 from sb3_said.delays.receivers import RECEIVERS
@@ -27,7 +28,8 @@ class DelayedObservationWrapper(
     - ``observation`` (obs_dim,): s_{t-age}, the newest observation that has arrived;
     - ``action_history`` (D, act_dim): the D newest actions a_{t-D..t-1}, oldest first, scaled to [-1, 1] from the
       bounds of the action space, zeros before the episode;
-    - ``delay`` (1,): the age of ``observation`` in control steps, plus those that actions take.
+    - ``delay`` (1,): how many of these do not show in ``observation`` yet: its age in control steps, plus those that
+      actions take.
 
     With ``state_history=True`` also what an agent that remembers would have, in the rows of the actions that led there:
 
@@ -37,7 +39,8 @@ class DelayedObservationWrapper(
     At reset s_0 arrives with age 0, and ages while it is all that has arrived, so an episode starts as a task with a
     smaller delay. ``info["undelayed_observation"]`` is the true state after the step, for replay and diagnosis only;
     ``info["forced_deliveries"]`` counts the packets of the episode that were delivered only because the age would have
-    exceeded the largest delay.
+    exceeded the largest delay. Where every action takes a time of its own, ``info["executed_action"]`` is what the task
+    was given, scaled like the history.
 
     ``gymnasium.wrappers.DelayObservation`` returns zeros before the first observation arrives, and neither the actions
     sent since nor the age, without which the process is not Markov (paper, Theorem 2.1).
@@ -45,13 +48,14 @@ class DelayedObservationWrapper(
     :param env: a task with a 1-D Box observation and a bounded Box action
     :param delay: d >= 0 control steps; or ``(low, high)``, drawn uniformly at every reset; or a delay process, also as
         text such as ``"UniformDelay(0, 8)"``
-    :param action_delay: control steps from choosing an action to its execution: >= 0; or ``(low, high)`` or a process
-        that draws one delay an episode. Time is the actuator's: the action is executed in the true state, and
-        observations look older by as much. The task starts when the first action arrives.
+    :param action_delay: control steps from choosing an action to its execution, in the forms of ``delay``. The task
+        starts when the first action arrives. One delay an episode: time is the actuator's, so the action is executed
+        in the true state, and observations look older by as much. One for each action: the newest that has arrived is
+        executed, and held until another arrives; ``delay`` counts the actions that do not show in ``observation``.
     :param max_delay: D, length of the action history; the largest delay by default. A larger one serves a model that
         was built for it.
-    :param receiver: ``"newest"`` keeps the newest observation that has arrived; ``"independent"`` reads an age drawn
-        anew at every step (paper, section 2)
+    :param receiver: ``"newest"`` keeps the newest packet that has arrived; ``"independent"`` reads an age drawn anew at
+        every step (paper, section 2); of observations, and of actions that take a time each
     :param state_history: see above; under ``"independent"`` states younger than ``observation`` may be known, under
         ``"newest"`` none are
     :raises ValueError: for other spaces, a bad delay, an unknown receiver, or a ``max_delay`` below the largest delay
@@ -110,7 +114,11 @@ class DelayedObservationWrapper(
             raise ValueError(f"max_delay={max_delay} is smaller than the largest delay {self.process.max_delay}.")
         if receiver not in RECEIVERS:
             raise ValueError(f"receiver is {receiver!r}, expected one of {tuple(RECEIVERS)}.")
-        self.receiver = RECEIVERS[receiver](self.process)
+        observed, self.actuator = self.process, None
+        if isinstance(self.process, TotalDelay) and self.process.action_varies:
+            observed = make_process(self.process.observation)
+            self.actuator = Actuator(RECEIVERS[receiver](make_process(self.process.action)), observed.max_delay)
+        self.receiver = RECEIVERS[receiver](observed)
 
         self._action_low, self._action_span = act_space.low, act_space.high - act_space.low
         self._action_is_scaled = bool(np.all(act_space.low == -1) and np.all(act_space.high == 1))
@@ -145,47 +153,59 @@ class DelayedObservationWrapper(
         state, info = self.env.reset(seed=seed, options=options)
         if seed is not None:
             self._rng = np.random.default_rng([seed, DELAY_STREAM])
+        if self.actuator is not None:
+            self.actuator.reset(self._rng.spawn(1)[0])
         self.receiver.reset(self._rng)
         self._states.clear()
         self._history[:] = self._received[:] = self._is_received[:] = 0.0
-        return self._observe(state, age=0), self._with_state(info)
+        return self._observe(state, age=0, lag=0), self._with_state(info)
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict[str, Any]]:
-        """Execute the action now; observe what has arrived.
+        """Send the action; observe what has arrived.
 
         :param action: (act_dim,), in the units of the action space
         :raises ValueError: when the process draws a delay outside 0..max_delay
         """
         state: Any
-        state, reward, terminated, truncated, info = self.env.step(action)
+        executed = action if self.actuator is None else self.actuator.execute(action)
+        state, reward, terminated, truncated, info = self.env.step(executed)
         if self.max_delay > 0:
             self._history[:-1] = self._history[1:]
             self._history[-1] = self._scale(action)
-        obs = self._observe(state, age=self.receiver.step())
-        return obs, reward, terminated, truncated, self._with_state(info)
+        age, lag = self.receiver.step(), 0
+        if self.actuator is not None:
+            lag = self.actuator.lag(age)
+            info = {**info, "executed_action": self._scale(executed)}
+        return self._observe(state, age, lag), reward, terminated, truncated, self._with_state(info)
 
-    def _observe(self, state: np.ndarray, age: int) -> dict[str, np.ndarray]:
+    def _observe(self, state: np.ndarray, age: int, lag: int) -> dict[str, np.ndarray]:
+        """Hand out the state of an age that is behind by ``lag`` actions more."""
         self._states.append(np.asarray(state, dtype=np.float32).copy())
         obs = {
             "observation": self._states[-1 - age].copy(),
             "action_history": self._history.copy(),
-            "delay": np.array([age], dtype=np.float32),
+            "delay": np.array([age + lag], dtype=np.float32),
         }
-        return obs | self._remember(obs["observation"], age) if self.state_history else obs
+        return obs | self._remember(obs["observation"], age, lag) if self.state_history else obs
 
-    def _remember(self, observation: np.ndarray, age: int) -> dict[str, np.ndarray]:
-        """Return all that was handed out, this observation included."""
+    def _remember(self, observation: np.ndarray, age: int, lag: int) -> dict[str, np.ndarray]:
+        """Return all that was handed out, this observation included, in the rows of the actions that led there."""
         for rows in (self._received, self._is_received):
             rows[:-1] = rows[1:]
             rows[-1] = 0.0
         self._received[-1 - age], self._is_received[-1 - age] = observation, 1.0
-        return {"state_history": self._received[1:].copy(), "state_known": self._is_received[1:].copy()}
+        states, known = np.zeros_like(self._received[1:]), np.zeros_like(self._is_received[1:])
+        states[: self.max_delay - lag], known[: self.max_delay - lag] = (
+            rows[1 + lag :] for rows in (self._received, self._is_received)
+        )
+        return {"state_history": states, "state_known": known}
 
     def _with_state(self, info: dict[str, Any]) -> dict[str, Any]:
         return {
             **info,
             "undelayed_observation": self._states[-1].copy(),
-            "forced_deliveries": self.receiver.forced_deliveries,
+            "forced_deliveries": self.receiver.forced_deliveries
+            + (0 if self.actuator is None else self.actuator.receiver.forced_deliveries),
         }
 
     def _scale(self, action: np.ndarray) -> np.ndarray:

@@ -73,6 +73,7 @@ class Player:
     """Plays random actions in parallel tasks.
 
     :param delay: of the wrapper, or None for the tasks as they are
+    :param action_delay: of the wrapper
     :param receiver: of the wrapper
     :param interruption: probability of a reset after a step, as when a run is resumed
     """
@@ -80,6 +81,7 @@ class Player:
     n_envs: int = 2
     delay: int | tuple[int, int] | DelayProcess | None = 2
     max_delay: int | None = None
+    action_delay: int | DelayProcess = 0
     receiver: str = "newest"
     max_length: int = 9
     interruption: float = 0.0
@@ -93,7 +95,9 @@ class Player:
             task = CountingTask(counter, self.max_length)
             if self.delay is None:
                 return task
-            return DelayedObservationWrapper(task, self.delay, max_delay=self.max_delay, receiver=self.receiver)
+            return DelayedObservationWrapper(
+                task, self.delay, self.action_delay, max_delay=self.max_delay, receiver=self.receiver
+            )
 
         self.vec = DummyVecEnv([make] * self.n_envs)
         self.vec.seed(self.seed)

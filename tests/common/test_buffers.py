@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_said.common.buffers import UNDELAYED, DelayedReplayBuffer
 from sb3_said.common.save_util import load_tree, save_tree
+from sb3_said.delays import UniformDelay
 
 
 def make_buffer(player, steps_per_env=20, buffer_class=DelayedReplayBuffer, **kwargs):
@@ -182,6 +183,29 @@ def test_the_stored_action_is_the_one_that_histories_hold():
     for t in range(9):
         np.testing.assert_array_equal(buffer.actions[t], rows[t + 1].obs["action_history"][:, -1])
         np.testing.assert_allclose(buffer.actions[t], rows[t].action, atol=1e-6)
+
+
+@settings(deadline=None)
+@given(processes(), st.sampled_from(["newest", "independent"]), st.integers(0, 2**16))
+def test_actions_that_take_a_time_each_are_stored_as_they_are_executed(process, receiver, seed):
+    player = Player(
+        n_envs=1, delay=process, action_delay=UniformDelay(0, 3), receiver=receiver, max_length=25, seed=seed
+    )
+    rows = player.play(70)
+    batch = batch_arrays(fill(make_buffer(player, 80), rows).sample(1000))
+    first = int(rows[0].states[0, 0])
+    states = {int(row.states[0, 0]): row.states[0] for row in rows}
+    executed = {int(row.states[0, 0]): row.infos[0]["executed_action"] for row in rows}
+    for i, tag in enumerate(batch[f"observations/{UNDELAYED}"][:, 0].astype(int).tolist()):
+        row = next(row for row in rows if int(row.states[0, 0]) == tag)
+        np.testing.assert_array_equal(batch["actions/"][i], executed[tag])
+        np.testing.assert_array_equal(batch[f"next_observations/{UNDELAYED}"][i], row.next_states[0])
+        n_unseen = int(row.obs["delay"].item())  # what was executed since, instead of what was sent since
+        np.testing.assert_array_equal(batch["observations/delay"][i], [n_unseen])
+        assert tag - n_unseen >= first
+        np.testing.assert_array_equal(batch["observations/observation"][i], states[tag - n_unseen])
+        for k in range(1, n_unseen + 1):
+            np.testing.assert_array_equal(batch["observations/action_history"][i, -k], executed[tag - k])
 
 
 def test_delay_zero_has_empty_histories():

@@ -23,6 +23,8 @@ from sb3_said.delays import (
     DroppedPackets,
     EpisodeDelay,
     FixedDelay,
+    HeldDelay,
+    TotalDelay,
     UniformDelay,
 )
 from sb3_said.delays.receivers import RECEIVERS, IndependentDraw
@@ -420,10 +422,78 @@ def test_action_delays_are_drawn_anew_each_episode():
     assert set(drawn) == set(range(2, 8)) and env.max_delay == 7
 
 
-def test_action_delays_of_every_packet_are_refused_with_a_remedy():
-    env = DelayedObservationWrapper(LoggedTask(), 2, WIFI_20MS)
-    with pytest.raises(ValueError, match="write action_delay=6"):
-        env.reset()
+@settings(deadline=None)
+@given(
+    processes(),
+    processes().filter(lambda p: TotalDelay(0, p).action_varies),
+    st.sampled_from(sorted(RECEIVERS)),
+    st.integers(0, 2),
+    st.integers(0, 2**16),
+)
+def test_actions_that_take_a_time_each(observation, action, receiver, spare, seed):
+    task = LoggedTask(length=25)
+    process = TotalDelay(observation, action)
+    max_delay = process.max_delay + spare
+    env = DelayedObservationWrapper(
+        task, observation, action, max_delay=max_delay, receiver=receiver, state_history=True
+    )
+    twin = DelayedObservationWrapper(LoggedTask(length=25), process, max_delay=max_delay, receiver=receiver)
+    there, back = RECEIVERS[receiver](action), RECEIVERS[receiver](observation)  # themselves tested against arrivals
+    env.action_space.seed(seed)
+    for episode in range(2):
+        obs, info = env.reset(seed=seed + episode)
+        twin.reset(seed=seed + episode)
+        rng = np.random.default_rng([seed + episode, 1])
+        there.reset(rng.spawn(1)[0])
+        back.reset(rng)
+        sent, arrived_as, handed_out = [], [], {0}  # arrived_as: which of those sent each step executed
+        for t in range(1, task.length + 1):
+            sent.append(env.action_space.sample())
+            arrived_as.append(t - 1 - (there.step() if t > 1 else 0))
+            obs, *_, info = env.step(sent[-1])
+            for key, value in twin.step(sent[-1])[0].items():
+                np.testing.assert_array_equal(value, obs[key])  # one process says the same as two
+            np.testing.assert_array_equal(task.actions[-1][-1], sent[arrived_as[-1]])
+            np.testing.assert_allclose(env._scale(task.actions[-1][-1]), info["executed_action"])
+            shown = t - back.step()
+            np.testing.assert_array_equal(obs["observation"], task.states[-1][shown])
+            newest = arrived_as[shown - 1] if shown > 0 else -1  # that shows in the observation
+            assert obs["delay"].item() == t - 1 - newest <= process.max_delay
+            n_sent = min(t, max_delay)
+            np.testing.assert_allclose(
+                obs["action_history"][max_delay - n_sent :], [env._scale(a) for a in sent[t - n_sent :]]
+            )
+            assert not obs["action_history"][: max_delay - n_sent].any()
+            assert info["forced_deliveries"] == there.forced_deliveries + back.forced_deliveries
+            np.testing.assert_array_equal(info["undelayed_observation"], task.states[-1][-1])
+            handed_out.add(shown)
+            # the row of the first action that does not show in it is the one after the observation's
+            offset = shown + int(obs["delay"].item()) - max_delay + 1
+            known = np.array([offset + row in handed_out for row in range(max_delay)], np.float32)
+            np.testing.assert_array_equal(obs["state_known"], known)
+            for row in np.flatnonzero(known):
+                np.testing.assert_array_equal(obs["state_history"][row], task.states[-1][offset + row])
+            assert not obs["state_history"][known == 0].any()
+            assert env.observation_space.contains(obs)
+
+
+def test_equal_delays_of_every_action_become_one_delay():
+    robot = LoggedTask(length=40)
+    env = DelayedObservationWrapper(robot, 2, UniformDelay(3, 3))
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    sent = [env.action_space.sample() for _ in range(30)]
+    delays = [env.step(action)[0]["delay"].item() for action in sent]
+    # a_0 is there from the start and is held until a_1 arrives, so that s_3 at t = 5 still shows no other
+    assert delays == [1, 2, 2, 3, 4, *[5] * 25]
+    np.testing.assert_array_equal(robot.actions[-1], [sent[max(t - 3, 0)] for t in range(30)])
+
+
+def test_one_delay_for_each_action_is_refused_inside_another_process():
+    env = DelayedObservationWrapper(LoggedTask(), HeldDelay(TotalDelay(2, WIFI_20MS)))
+    env.reset()
+    with pytest.raises(ValueError, match=r"draws a delay for every action, .* not inside another process"):
+        env.step(env.action_space.sample())
     with pytest.raises(ValueError, match="delay"):
         DelayedObservationWrapper(LoggedTask(), 2, -1)
 
