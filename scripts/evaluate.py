@@ -11,7 +11,7 @@ from typing import Any
 import torch as th
 from runs import LoadedRun, answering, answers, load_run, origin
 from tqdm import tqdm
-from zoo import add_delay, read_delay
+from zoo import add_delay, read_delay, write_text
 
 from sb3_said.evaluation import Summary, collect_observations, measure_latency, plots, rollout
 
@@ -91,7 +91,7 @@ def main(argv: list[str] | None = None) -> None:
         "results": [summary.to_dict() for summary in summaries],
         "origin": origin(run),
     }
-    target.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n")
+    write_text(target, json.dumps(document, indent=2, allow_nan=False) + "\n")
     print(f"Wrote {target}")
     if args.plot is not None:
         draw(args.plot, summaries, run.folder)

@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 import torch as th
 from runs import LoadedRun, answering, answers, load_run, longest_delay, origin
-from winner import write_text
-from zoo import Delay, largest_delay, read_delay
+from zoo import Delay, largest_delay, read_delay, write_text
 
 from sb3_said.delays import FixedDelay
 from sb3_said.delays.processes import make_process

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import functools
 import sys
 from pathlib import Path
+from typing import Any
 
 import rl_zoo3.train
 from zoo import (
@@ -48,7 +48,8 @@ def parser() -> argparse.ArgumentParser:
         "--preset",
         choices=PRESETS,
         default=default_preset(),
-        help="cpu: hours on two cores; paper: the paper's table; quick, smoke: minutes (default here: %(default)s)",
+        help="cpu: hours on two cores; paper: the paper's table, with a planner for every delay (mask='random') where "
+        "--delay varies; quick, smoke: minutes (default here: %(default)s)",
     )
     parser.add_argument(
         "--checkpoint-freq",
@@ -77,9 +78,30 @@ def main(argv: list[str]) -> None:
     if expert_delay is not None and (options.algo != "said" or delay is None):
         parser().error("--expert-delay is for --algo said with a --delay: who has no planner acts as it has learned")
     run = Run(argv, delay, options.preset, options.checkpoint_freq, options.resume, expert_delay)
-    rl_zoo3.train.ExperimentManager = functools.partial(DelayedExperimentManager, run)  # type: ignore[misc,assignment]
+
+    def make_manager(*args: Any, **kwargs: Any) -> DelayedExperimentManager:
+        try:
+            return DelayedExperimentManager(run, *args, **kwargs)
+        except ValueError as error:
+            parser().error(str(error))
+
+    rl_zoo3.train.ExperimentManager = make_manager  # type: ignore[misc,assignment]
+    zoo_argv = joined_settings(zoo_argv)
     sys.argv = [sys.argv[0], "--algo", options.algo, *zoo_argv, *(["--help"] if options.help else [])]
     rl_zoo3.train.train()
+
+
+def joined_settings(argv: list[str]) -> list[str]:
+    """Return a command line in which each option of KEY:VALUE words stands once, last, with the words of all its uses.
+
+    rl_zoo3 reads only the last use, by which a resume that changes one setting would drop the others. Of one key given
+    twice, rl_zoo3 takes the later value.
+    """
+    settings = argparse.ArgumentParser(add_help=False, allow_abbrev=False)  # "--env" is not short for "--env-kwargs"
+    for names in (("-params", "--hyperparams"), ("--env-kwargs",), ("--eval-env-kwargs",)):
+        settings.add_argument(*names, dest=names[0], nargs="+", action="extend", default=[])
+    given, rest = settings.parse_known_args(argv)
+    return [*rest, *(word for name, words in vars(given).items() if words for word in (name, *words))]
 
 
 def without_resume(argv: list[str]) -> list[str]:

@@ -16,7 +16,8 @@ from evaluate import evaluate
 from optuna.trial import FrozenTrial
 from runs import LoadedRun, load_run, origin
 from study import Search, returns_of, save_plots
-from winner import RunConfig, write_text
+from winner import RunConfig
+from zoo import write_text
 
 from sb3_said import SAID
 from sb3_said.common.checkpoint import CHECKPOINT_NAME

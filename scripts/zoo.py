@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import functools
 import json
+import os
 import re
 import sys
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC, PlannerTrainingCallback
 from sb3_said.common.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback, restore_training
-from sb3_said.delays.processes import make_process
+from sb3_said.delays.processes import FixedDelay, make_process
 
 #: A delay as YAML has it: control steps, [low, high], or a process as text; None for a task without the wrapper.
 Delay = int | list[int] | str | None
@@ -93,12 +94,18 @@ def largest_delay(delay: Delay) -> int:
     return 0 if delay is None else make_process(delay).max_delay
 
 
+def varies(delay: Delay) -> bool:
+    """Say whether a delay is another one in each episode, or at each step."""
+    return delay is not None and not isinstance(make_process(delay), FixedDelay)
+
+
 def preset_overrides(config: str | Path, preset: str, env_id: str, delay: Delay) -> dict[str, Any]:
     """Return what a preset changes for a task: its own entry of ``presets:`` in the file, or the preset's default.
 
     ``cpu`` is what the file says outside ``presets:``, so that rl_zoo3 alone reads it too.
 
-    :param delay: ``planner_by_delay`` is looked up by the largest it can be
+    :param delay: ``planner_by_delay`` is looked up by the largest it can be; where it varies, a preset's planner of one
+        delay (``mask: fixed``) becomes one of all delays
     :raises ValueError: for a preset the file does not have
     """
     if preset == "cpu":
@@ -110,6 +117,8 @@ def preset_overrides(config: str | Path, preset: str, env_id: str, delay: Delay)
     tuned = overrides.pop("planner_by_delay", {}).get(largest_delay(delay))
     if tuned is not None:
         overrides["planner_kwargs"] = {**overrides["planner_kwargs"], "depth": tuned[0], "temperature": tuned[1]}
+    if varies(delay) and overrides.get("planner_kwargs", {}).get("mask") == "fixed":
+        overrides["planner_kwargs"] = {**overrides["planner_kwargs"], "mask": "random"}
     return overrides
 
 
@@ -172,11 +181,9 @@ class DelayedExperimentManager(ExperimentManager):
             raise ValueError("--expert-delay sets the wrapper itself; leave env_wrapper out of -params.")
         self.custom_hyperparams = {**overrides, **(self.custom_hyperparams or {})}
         planner_kwargs = self.custom_hyperparams.get("planner_kwargs")
-        varies = run.delay is not None and not isinstance(run.delay, int)
-        if varies and isinstance(planner_kwargs, dict) and planner_kwargs.get("mask") == "fixed":
+        if varies(run.delay) and isinstance(planner_kwargs, dict) and planner_kwargs.get("mask") == "fixed":
             raise ValueError(
-                f"A planner with mask='fixed' serves one delay, got --delay {run.delay}; "
-                "use mask='random' (another --preset, or -params planner_kwargs:\"dict(mask='random')\")."
+                f"A planner with mask='fixed' serves one delay, got --delay {run.delay}; leave mask out of -params."
             )
 
     def create_envs(self, *args: Any, **kwargs: Any) -> VecEnv:
@@ -197,8 +204,10 @@ class DelayedExperimentManager(ExperimentManager):
     def create_log_folder(self) -> None:
         super().create_log_folder()
         self.monitor_kwargs["override_existing"] = not self.checkpoint.exists()
-        seed = [] if "--seed" in self.run.argv else ["--seed", str(self.seed)]
-        (Path(self.save_path) / ARGUMENTS_NAME).write_text(json.dumps([*self.run.argv, *seed]))
+        # What was not given and may be another on a resume: the seed is drawn, the preset depends on the machine.
+        chosen = {"--preset": self.run.preset, "--seed": str(self.seed)}
+        words = [word for name, value in chosen.items() if name not in self.run.argv for word in (name, value)]
+        write_arguments(Path(self.save_path), [*self.run.argv, *words])
 
     def create_callbacks(self) -> None:
         super().create_callbacks()
@@ -215,12 +224,13 @@ class DelayedExperimentManager(ExperimentManager):
         if resumes:
             restore_training(model, self.checkpoint, CallbackList(self.callbacks))  # type: ignore[arg-type]
             print(f"Resuming {self.save_path} at step {model.num_timesteps}")
-        model.set_logger(self._logger(model))
+        taken = model.num_timesteps if resumes else 0  # learn() counts the steps of an agent given with -i anew
+        model.set_logger(self._logger(taken))
         # rl_zoo3: -1 is the default, anything below logs nothing by itself
         log_interval = {-1: 4}.get(self.log_interval, self.log_interval if self.log_interval > 0 else None)
         try:
             model.learn(
-                max(self.n_timesteps - model.num_timesteps, 0),
+                max(self.n_timesteps - taken, 0),
                 callback=self.callbacks,
                 log_interval=log_interval,  # type: ignore[arg-type]  # SB3 takes None and says so in its docstring
                 reset_num_timesteps=not resumes,
@@ -231,9 +241,12 @@ class DelayedExperimentManager(ExperimentManager):
             if model.env is not None:
                 model.env.close()
 
-    def _logger(self, model: BaseAlgorithm) -> Logger:
-        """Log to the screen, to progress.csv (one file per resume) and to TensorBoard if asked for."""
-        formats = [make_output_format("csv", self.save_path, log_suffix(Path(self.save_path), model.num_timesteps))]
+    def _logger(self, steps: int) -> Logger:
+        """Log to the screen, to progress.csv (one file per resume) and to TensorBoard if asked for.
+
+        :param steps: environment steps the run has taken
+        """
+        formats = [make_output_format("csv", self.save_path, log_suffix(Path(self.save_path), steps))]
         if self.verbose > 0:
             formats.append(make_output_format("stdout", self.save_path))
         if self.tensorboard_log is not None:
@@ -249,6 +262,18 @@ def log_suffix(folder: Path, steps: int) -> str:
     """
     names = ["" if steps == 0 else f"_{steps}", *(f"_{steps}_{k}" for k in range(2, 1000))]
     return next(name for name in names if not (folder / f"progress{name}.csv").exists())
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file whole or not at all."""
+    unfinished = path.with_name(f"{path.name}.{os.getpid()}")
+    unfinished.write_text(text)
+    unfinished.replace(path)
+
+
+def write_arguments(run_dir: Path, argv: list[str]) -> None:
+    """Keep the command line of a run for ``read_arguments``."""
+    write_text(run_dir / ARGUMENTS_NAME, json.dumps(argv))
 
 
 def read_arguments(run_dir: Path) -> list[str]:

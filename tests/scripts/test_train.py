@@ -9,14 +9,16 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import train
+import yaml
 import zoo
 from runs import load_run
 
-from sb3_said import SAID, PlannerConfig
+from sb3_said import SAID, DelayedSAC, PlannerConfig
 from sb3_said.common.save_util import load_tree
 
 SCRIPTS = Path(zoo.__file__).parent
@@ -94,6 +96,54 @@ def test_a_killed_run_goes_on_from_its_checkpoint_twice_alike(tmp_path: Path) ->
     assert steps.tolist() == [300, 600]
 
 
+def train_here(folder: Path, command: str, *more: str | Path) -> None:
+    """Train in this process, which is quicker than in one of its own."""
+    common = ["--num-threads", "1", "--eval-freq", "-1", "--device", "cpu", "--verbose", "0", "-f", folder]
+    train.main([*command.split(), *map(str, [*common, *more])])
+
+
+def config_of(run: Path) -> dict[str, Any]:
+    """Return the hyper-parameters that a run was last trained with."""
+    (file,) = run.glob("*/config.yml")
+    return dict(yaml.load(file.read_text(), Loader=yaml.UnsafeLoader))
+
+
+def test_a_given_agent_learns_as_many_steps_as_a_new_one(tmp_path: Path) -> None:
+    command, name = "--algo said --env Pendulum-v1 --delay 1 --preset smoke -n 150 --seed 3", "Pendulum-v1.zip"
+    params = ["-params", "learning_starts:100", "planner_gradient_steps:2", TINY_PLANNER]
+    first, second = (tmp_path / "said" / f"Pendulum-v1-delay1_{k}" for k in (1, 2))
+    train_here(tmp_path, command, *params)
+    train_here(tmp_path, command, "-i", first / name, *params)
+    before, after = (SAID.load(run / name) for run in (first, second))
+    assert before.num_timesteps == after.num_timesteps == 150 and after.policy.planner_is_trained
+    left, right = (agent.policy.actor.state_dict() for agent in (before, after))
+    assert not all((left[key] == right[key]).all() for key in left)
+    assert (second / "progress.csv").exists()  # the log of a new run, not of a resumed one
+    train.main(["--resume", str(second), "-n", "170"])  # a resume does go on from where the run was
+    assert SAID.load(second / name).num_timesteps == 170
+    assert (second / "progress_150.csv").exists()
+
+
+def test_a_resume_keeps_what_it_is_not_told_to_change(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(train, "default_preset", lambda: "smoke")
+    train_here(tmp_path, "--algo dr --env Pendulum-v1 -n 60", "-params", "gamma:0.9", "tau:0.01")
+    run = tmp_path / "dr" / "Pendulum-v1_1"
+    before = config_of(run)
+    assert (before["gamma"], before["tau"], before["buffer_size"]) == (0.9, 0.01, 2000)
+    monkeypatch.setattr(train, "default_preset", lambda: "cpu")  # as on another machine
+    for _ in range(2):
+        train.main(["--resume", str(run), "-n", "80", "-params", "tau:0.02", "gradient_steps:2"])
+        assert config_of(run) == {**before, "tau": 0.02, "gradient_steps": 2}
+    assert DelayedSAC.load(run / "Pendulum-v1.zip").num_timesteps == 80
+
+
+def test_optimize_searches_and_writes_its_trials(tmp_path: Path) -> None:
+    command = "--algo sadr --env Pendulum-v1 --delay 1 --preset smoke -n 20 --seed 3 --eval-episodes 1"
+    train_here(tmp_path, command, *"-optimize --n-trials 1 --n-evaluations 1 --no-optim-plots".split())
+    (table,) = (tmp_path / "sadr").glob("report_*.csv")
+    assert "params_learning_rate" in table.read_text().splitlines()[0]
+
+
 def test_the_delay_range_and_its_flags_reach_the_run(tmp_path: Path) -> None:
     run(
         *"--algo dr --env Pendulum-v1 --delay 0 3 --preset smoke -n 120 --eval-freq -1 --num-threads 1".split(),
@@ -123,6 +173,28 @@ def test_the_paper_preset_is_the_papers_table(env_id: str, delay: int) -> None:
     assert settings["n_timesteps"] == 5e6 and settings["planner_gradient_steps"] == 1_000_000
     config = PlannerConfig(**settings["planner_kwargs"])
     assert config == PlannerConfig.paper(depth=depth, temperature=temperature, precision="auto")
+
+
+@pytest.mark.parametrize("delay", [None, 8, "8", "FixedDelay(8)"])
+def test_the_papers_planner_knows_one_delay(delay: zoo.Delay) -> None:
+    settings = zoo.preset_overrides(zoo.config_file("said"), "paper", "Hopper-v5", delay)
+    assert settings["planner_kwargs"]["mask"] == "fixed"
+
+
+@pytest.mark.parametrize("delay", [[0, 8], "UniformDelay(0, 8)"])
+def test_under_a_delay_that_varies_the_papers_planner_knows_all(delay: zoo.Delay) -> None:
+    fixed, varying = (
+        zoo.preset_overrides(zoo.config_file("said"), "paper", "Hopper-v5", d)["planner_kwargs"] for d in (8, delay)
+    )
+    assert varying == {**fixed, "mask": "random"}
+
+
+def test_a_planner_of_one_delay_is_refused_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        train_here(
+            tmp_path, "--algo said --env Pendulum-v1 --delay 0 3", "-params", "planner_kwargs:dict(mask='fixed')"
+        )
+    assert "A planner with mask='fixed' serves one delay, got --delay [0, 3]" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("preset", zoo.PRESETS)
@@ -218,6 +290,32 @@ def test_help_shows_both_command_lines(capsys: pytest.CaptureFixture[str]) -> No
 
 def test_resume_is_taken_out_of_a_command_line() -> None:
     assert train.without_resume(["--resume", "a", "-P", "--resume=b", "-n", "5"]) == ["-P", "-n", "5"]
+
+
+@pytest.mark.parametrize(
+    ("given", "read"),
+    [
+        ("-n 5 --eval-freq -1", "-n 5 --eval-freq -1"),
+        ("-params a:1 b:2 -n 5 --hyperparams b:3 -P", "-n 5 -P -params a:1 b:2 b:3"),
+        ("--env X --env-kwargs c:1 -params a:1 --env-kwargs d:2", "--env X -params a:1 --env-kwargs c:1 d:2"),
+    ],
+)
+def test_settings_given_twice_are_joined(given: str, read: str) -> None:
+    assert train.joined_settings(given.split()) == read.split()
+
+
+def test_the_command_line_is_kept_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    zoo.write_arguments(tmp_path, ["-n", "5"])
+    write = Path.write_text
+
+    def killed(path: Path, text: str) -> None:
+        write(path, text[:3])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "write_text", killed)
+    with pytest.raises(KeyboardInterrupt):
+        zoo.write_arguments(tmp_path, ["-n", "70"])
+    assert zoo.read_arguments(tmp_path) == ["-n", "5"]
 
 
 def test_no_log_is_overwritten(tmp_path: Path) -> None:
