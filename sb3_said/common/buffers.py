@@ -33,8 +33,8 @@ class DelayedReplayBuffer(ReplayBuffer):
     observations have the extra key ``undelayed_observation``, the true state, for a delay-reconciled critic, and no
     ``state_history``, which neither actor nor critics read.
 
-    The stored action is the one that was executed, as ``action_history`` says, or ``info["executed_action"]`` where each
-    action takes a time of its own to the actuator. The critics' transitions are the task's own there, too; rebuilt
+    The stored action is the one that was executed, as ``action_history`` says, or ``info["executed_action"]`` where
+    each action takes a time of its own to the actuator. The critics' transitions are the task's own there, too; rebuilt
     histories hold what was executed instead of what was sent, which differs while delays change.
 
     :param buffer_size: transitions over all environments
@@ -107,17 +107,15 @@ class DelayedReplayBuffer(ReplayBuffer):
         :param next_obs: observation after it; at an episode's end its last one, not the one after reset
         :param action: (n_envs, act_dim) in [-1, 1]
         :param infos: each with ``undelayed_observation`` when the space is delayed
-        :raises ValueError: when the true state is missing, or an episode starts with an old observation
+        :raises ValueError: when the true state is missing, or the past of ``obs`` is neither stored nor empty, or
+            ``next_obs`` is not one action later
         """
         obs, next_obs = (x if isinstance(x, dict) else {"observation": x} for x in (obs, next_obs))
         row, previous = self.pos, (self.pos - 1) % self.buffer_size
         continues = self._continues(obs)
+        if self.is_delayed:
+            self._check_order(obs, next_obs, continues)
         started = np.flatnonzero(~continues)
-        if self.is_delayed and np.any(obs["delay"][started] != 0):
-            raise ValueError(
-                "The first observation of an episode must have age 0, but one is "
-                f"{obs['delay'].max():.0f} steps old: transitions must be added in the order they happened."
-            )
         if self.full:
             self._free(row)
         if self.size() > 0:
@@ -151,6 +149,40 @@ class DelayedReplayBuffer(ReplayBuffer):
             np.all((obs[key] == self._expected[key]).reshape(self.n_envs, -1), axis=1) for key in self._expected
         ]  # fails where training was interrupted and the environment reset
         return np.logical_and.reduce(same) & (self.dones[self.pos - 1] == 0)
+
+    def knows_past(self, obs: np.ndarray | dict[str, np.ndarray]) -> np.ndarray:
+        """Tell for each environment whether a step from ``obs`` can be added: the newest step led there, or none did.
+
+        :param obs: as in :meth:`add`
+        :return: (n_envs,) bool
+        """
+        if not isinstance(obs, dict):
+            return np.ones(self.n_envs, bool)
+        return self._continues(obs) | self._starts(obs)
+
+    def _starts(self, obs: dict[str, np.ndarray]) -> np.ndarray:
+        """Tell for each environment whether ``obs`` can be the first of an episode: (n_envs,) bool."""
+        past = (obs[key].reshape(self.n_envs, -1) for key in ("delay", "action_history"))
+        return np.logical_and.reduce([np.all(part == 0, axis=1) for part in past])
+
+    def _check_order(self, obs: dict[str, np.ndarray], next_obs: dict[str, np.ndarray], continues: np.ndarray) -> None:
+        """:raises ValueError: for a transition that, as histories and ages tell, is out of order"""
+        history = obs["action_history"]
+        if not continues.all() and (joined := np.flatnonzero(~continues & ~self._starts(obs))).size:
+            env = joined[0]
+            raise ValueError(
+                f"The first observation of an episode must have age 0 and an empty past, but that of environment {env} "
+                f"has {np.any(history[env] != 0, axis=-1).sum()} actions sent before it and is "
+                f"{obs['delay'][env, 0]:.0f} steps old: transitions must be added in the order they happened. Empty or "
+                "replace a replay between two calls of learn(), which then starts new episodes, not during one."
+            )
+        one_later = np.all(next_obs["action_history"][:, :-1] == history[:, 1:], axis=(1, 2))
+        if not one_later.all():  # a step between the two was not added, or not taken
+            raise ValueError(
+                f"The observation after the action of environment {np.flatnonzero(~one_later)[0]} does not follow the "
+                "one before it: its action_history is not the same with one action more. Transitions must be added in "
+                "the order they happened, and each of them."
+            )
 
     def _true_states(self, next_obs: dict[str, np.ndarray], infos: list[dict[str, Any]]) -> np.ndarray:
         if not self.is_delayed:

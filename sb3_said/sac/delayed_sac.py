@@ -12,7 +12,13 @@ from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import DictReplayBufferSamples, GymEnv, ReplayBufferSamples, Schedule
+from stable_baselines3.common.type_aliases import (
+    DictReplayBufferSamples,
+    GymEnv,
+    ReplayBufferSamples,
+    RolloutReturn,
+    Schedule,
+)
 from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -128,9 +134,26 @@ class DelayedSAC(SafeSaveMixin, SAC):
         return {"augment_state": self.augment_state, "delay_reconciled_critic": self.delay_reconciled_critic}
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        obs = self._last_obs if self._vec_normalize_env is None else self._last_original_obs
+        if obs is not None and not self.replay_buffer.knows_past(obs).all():  # emptied, or not loaded with the agent
+            self._last_obs = None  # SB3 then resets the environments
         learn = super()._setup_learn(*args, **kwargs)
         self.trained_delay = _written(_process_of(self.env))
         return learn
+
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
+        """Collect as SB3 does, which does not store the step at which a callback ends training, or an exception.
+
+        The next ``learn`` starts new episodes then, instead of going on from an observation that is gone.
+        """
+        is_whole = False
+        try:
+            rollout = super().collect_rollouts(*args, **kwargs)
+            is_whole = rollout.continue_training
+        finally:
+            if not is_whole:
+                self._last_obs = None
+        return rollout
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Take another environment, as SB3 does; see :meth:`check_delay` for one with another delay."""
@@ -263,10 +286,10 @@ class DelayedSAC(SafeSaveMixin, SAC):
 
 
 def _process_of(env: VecEnv | None) -> DelayProcess | None:
-    try:
-        return None if env is None else env.get_attr("process")[0]
-    except AttributeError:
+    # Asked for first: a missing attribute ends the workers of a SubprocVecEnv. A plain task may have one of its own.
+    if env is None or not isinstance(env.observation_space, spaces.Dict) or not env.has_attr("process"):
         return None
+    return env.get_attr("process")[0]
 
 
 def _written(process: DelayProcess | None) -> str | None:

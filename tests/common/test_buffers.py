@@ -423,6 +423,28 @@ def test_transitions_out_of_order_are_refused():
         fill(make_buffer(player), [*rows[:3], *rows[4:]])
 
 
+def test_an_episode_joined_at_age_zero_is_refused_too():
+    player = Player(n_envs=1, delay=0, max_delay=3, max_length=100)
+    rows = player.play(6)
+    assert rows[2].obs["delay"] == 0
+    with pytest.raises(ValueError, match=r"environment 0 .* 2 actions sent before"):
+        make_buffer(player).add(*rows[2].added())
+    buffer = fill(make_buffer(player), rows[:2])
+    with pytest.raises(ValueError, match=r"environment 0 .* 3 actions sent before"):
+        buffer.add(*rows[3].added())
+    assert_exact(fill(buffer, rows[2:]), rows)  # a refusal changes nothing
+
+
+def test_a_step_between_two_observations_that_do_not_follow_each_other_is_refused():
+    player = Player(n_envs=2, delay=3, max_length=100)
+    rows = player.play(8)
+    stale = replace(rows[5], obs=rows[4].obs)  # as after a step that was taken and not stored
+    buffer = fill(make_buffer(player), rows[:4])
+    with pytest.raises(ValueError, match="environment 0 does not follow"):
+        buffer.add(*stale.added())
+    assert_exact(fill(buffer, rows[4:]), rows)
+
+
 OTHER_BUFFERS = {
     "size": lambda: make_buffer(Player(), 19),
     "full size": lambda: make_buffer(Player(), 30),
