@@ -224,6 +224,7 @@ class DelayedExperimentManager(ExperimentManager):
         if resumes:
             restore_training(model, self.checkpoint, CallbackList(self.callbacks))  # type: ignore[arg-type]
             print(f"Resuming {self.save_path} at step {model.num_timesteps}")
+            drop_undone_episodes(Path(self.save_path), model.num_timesteps // model.n_envs)
         taken = model.num_timesteps if resumes else 0  # learn() counts the steps of an agent given with -i anew
         model.set_logger(self._logger(taken))
         # rl_zoo3: -1 is the default, anything below logs nothing by itself
@@ -262,6 +263,24 @@ def log_suffix(folder: Path, steps: int) -> str:
     """
     names = ["" if steps == 0 else f"_{steps}", *(f"_{steps}_{k}" for k in range(2, 1000))]
     return next(name for name in names if not (folder / f"progress{name}.csv").exists())
+
+
+def drop_undone_episodes(run_dir: Path, steps: int) -> None:
+    """Cut from SB3's monitor files the episodes that a resume undoes: those that ended after the checkpoint.
+
+    The episode amid which the checkpoint was written is in no file: what follows lags behind the run by its length.
+
+    :param steps: that each environment had taken at the checkpoint
+    """
+    for file in run_dir.glob("*.monitor.csv"):
+        lines = file.read_bytes().splitlines(keepends=True)
+        size, taken = len(b"".join(lines[:2])), 0  # a comment and the header: r,l,t
+        for line in lines[2:]:
+            taken += int(line.split(b",")[1]) if line.endswith(b"\n") else steps + 1  # unfinished: undone, too
+            if taken > steps:
+                break
+            size += len(line)
+        os.truncate(file, size)  # in place: the environments have opened it, to append to it
 
 
 def write_text(path: Path, text: str) -> None:

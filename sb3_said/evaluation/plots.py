@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import math
 import re
 import textwrap
@@ -248,11 +249,17 @@ def _running_total(counts: Sequence[float]) -> list[float]:
 
 
 def _read_monitors(files: Sequence[Path]) -> tuple[np.ndarray, np.ndarray]:
-    """Return environment steps and returns of all episodes in the order of time, (n,) each."""
-    episodes = []
+    """Return environment steps and returns of all episodes in the order in which they ended, (n,) each.
+
+    The order is not that of the files' times, which begin anew with each resume.
+
+    :param files: one for each environment; they take their steps side by side
+    """
+    ends: list[int] = []
+    returns: list[float] = []
     for file in files:
-        lines = file.read_text().splitlines()[1:]  # the first line is a JSON comment
-        episodes += [(float(row["t"]), int(float(row["l"])), float(row["r"])) for row in csv.DictReader(lines)]
-    episodes.sort()
-    lengths = np.array([length for _, length, _ in episodes], np.int64)
-    return np.cumsum(lengths), np.array([reward for *_, reward in episodes])
+        rows = list(csv.DictReader(file.read_text().splitlines()[1:]))  # the first line is a JSON comment
+        ends += [len(files) * end for end in itertools.accumulate(int(float(row["l"])) for row in rows)]
+        returns += [float(row["r"]) for row in rows]
+    order = np.argsort(ends, kind="stable")
+    return np.array(ends, np.int64)[order], np.array(returns)[order]

@@ -36,11 +36,19 @@ def test_learning_curve(tmp_path: Path, png: Path) -> None:
     np.savez(tmp_path / "evaluations.npz", timesteps=[500, 1000], results=np.random.default_rng(0).normal(size=(2, 5)))
     ax = plots.plot_learning_curve(tmp_path)
     steps, returns = ax.lines[0].get_data()
-    # Two environments, in the order of time: 50 and 20 steps in turn.
-    np.testing.assert_array_equal(steps[:4], [50, 70, 120, 140])
-    np.testing.assert_array_equal(returns[:4], [10.0, -5.0, 11.0, -5.0])
+    # Two environments side by side, in episodes of 50 and 20 steps.
+    np.testing.assert_array_equal(steps[:6], [40, 80, 100, 120, 160, 200])
+    np.testing.assert_array_equal(returns[:6], [-5.0, -5.0, 10.0, -5.0, -5.0, 11.0])
     plots.save(ax, png)
     assert drawn(png)
+
+
+def test_the_learning_curve_of_a_resumed_run(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    write_monitor(tmp_path, 0, [(1.0, 10, 5.0), (2.0, 10, 9.0), (3.0, 30, 4.0)])  # whose clock began anew
+    steps, returns = plots.plot_learning_curve(tmp_path).lines[0].get_data()
+    np.testing.assert_array_equal(steps, [10, 20, 50])
+    np.testing.assert_array_equal(returns, [1.0, 2.0, 3.0])
 
 
 def test_returns_of_planner_and_expert(png: Path) -> None:

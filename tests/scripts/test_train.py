@@ -137,6 +137,25 @@ def test_a_resume_keeps_what_it_is_not_told_to_change(tmp_path: Path, monkeypatc
     assert DelayedSAC.load(run / "Pendulum-v1.zip").num_timesteps == 80
 
 
+def lengths(monitor: Path) -> list[int]:
+    """Return the lengths of the episodes in a file of SB3's Monitor."""
+    return [int(row.split(",")[1]) for row in monitor.read_text().splitlines()[2:]]
+
+
+def test_episodes_after_the_checkpoint_are_not_counted_twice(tmp_path: Path) -> None:
+    train_here(tmp_path, "--algo sa --env InvertedPendulum-v5 --preset smoke -n 200 --seed 3", "-params", "n_envs:2")
+    run = tmp_path / "sa" / "InvertedPendulum-v5_1"
+    before = [lengths(run / f"{k}.monitor.csv") for k in (0, 1)]
+    for k in (0, 1):
+        with (run / f"{k}.monitor.csv").open("a") as monitor:
+            monitor.write("70.0,70,9.5\n7.0,7,9.9\n8.0,")  # what a run that was killed at a full disk had gone on to
+    train.main(["--resume", str(run), "-n", "320"])
+    for k in (0, 1):
+        now = lengths(run / f"{k}.monitor.csv")
+        assert now[: len(before[k])] == before[k] and len(now) > len(before[k])
+        assert sum(now) <= 160 and now[len(before[k])] != 70
+
+
 def test_optimize_searches_and_writes_its_trials(tmp_path: Path) -> None:
     command = "--algo sadr --env Pendulum-v1 --delay 1 --preset smoke -n 20 --seed 3 --eval-episodes 1"
     train_here(tmp_path, command, *"-optimize --n-trials 1 --n-evaluations 1 --no-optim-plots".split())
