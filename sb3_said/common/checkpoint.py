@@ -119,10 +119,17 @@ def restore_training(model: OffPolicyAlgorithm, path: str | Path, callback: Base
         _restore_vec_normalize(vec_normalize, state["vec_normalize"])
     for eval_callback, kept in zip(eval_callbacks, state["evaluations"], strict=True):
         _restore_evaluations(eval_callback, kept)
+    model._last_obs = None  # the replay's newest episode is not the environment's, even where it looks so
     if model.seed is not None and model.env is not None:
-        model.env.seed((model.seed + model.num_timesteps) % 2**31)
-        model.action_space.seed((model.seed + model.num_timesteps) % 2**31)
+        seed = _seed_of_resume(model.seed, model.num_timesteps)
+        model.env.seed(seed)
+        model.action_space.seed(seed)
     restore_random_state(state["random"])
+
+
+def _seed_of_resume(seed: int, steps: int) -> int:
+    """Return a seed that no other use has: large, where those of runs, evaluation and tuning are small numbers."""
+    return 2**30 + int(np.random.SeedSequence([seed, steps]).generate_state(1)[0]) % 2**30
 
 
 def random_state() -> dict[str, Any]:

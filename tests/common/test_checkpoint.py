@@ -9,7 +9,7 @@ import pytest
 import torch as th
 from kill import Kill, Killed
 from stable_baselines3 import SAC
-from stable_baselines3.common.callbacks import CallbackList, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecNormalize
@@ -158,6 +158,46 @@ def test_a_resumed_environment_starts_a_new_episode(tmp_path):
         starts.append(buffer.observations[50, 0])
     assert np.array_equal(starts[0], starts[1])
     assert not np.array_equal(starts[0], starts[2]) and not np.array_equal(starts[0], first)
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_a_resumed_environment_meets_no_episode_of_another_use(tmp_path, n_envs):
+    """Evaluation takes the seeds from 10000 on and tuning those from 20000 on: small numbers, as a user's own are."""
+    model = make(make_vec_env(delayed, n_envs=n_envs), seed=1)
+    path = run_and_kill(model, tmp_path)
+    seeds = []
+    for seed, steps in ((1, 50), (1, 50), (1, 9999), (51, 50), (50, 51)):
+        state = load_tree(path)
+        state["counters"]["num_timesteps"] = steps
+        save_tree(path, state)
+        resumed = make(make_vec_env(delayed, n_envs=n_envs), seed=seed)
+        restore_training(resumed, path)
+        seeds.append(tuple(resumed.env._seeds))
+    assert seeds[0] == seeds[1] and len(set(seeds)) == 4
+    assert all(2**30 <= seed < 2**32 for each in seeds for seed in each)
+
+
+def test_a_resume_starts_a_new_episode_in_a_model_that_was_amid_one(tmp_path):
+    path = run_and_kill(make(), tmp_path)
+    fresh, used = make(), make().learn(50)
+    for model in (fresh, used):
+        restore_training(model, path)
+        model.learn(20, reset_num_timesteps=False)
+    assert_same(everything(fresh), everything(used))
+
+
+def test_a_resume_after_a_callback_has_ended_training_joins_no_two_episodes(tmp_path):
+    class Stop(BaseCallback):
+        def _on_step(self):
+            return self.num_timesteps < 40
+
+    make().learn(100, [TrainingCheckpointCallback(tmp_path, 1000), Stop()])
+    model = make()
+    restore_training(model, tmp_path / CHECKPOINT_NAME)
+    buffer = model.replay_buffer
+    assert (model.num_timesteps, buffer.size()) == (40, 39)  # SB3 does not store the last
+    model.learn(20, reset_num_timesteps=False)
+    assert buffer.steps[:59, 0].tolist() == [*range(15), *range(15), *range(9), *range(15), *range(5)]
 
 
 # ---------------------------------------------------------------------------------------------------- writing
