@@ -8,6 +8,7 @@ Reading one builds only plain values, arrays and tensors, so a file from a stran
 from __future__ import annotations
 
 import contextlib
+import glob
 import importlib.metadata
 import json
 import math
@@ -50,7 +51,7 @@ def save_tree(path: PathOrFile, tree: Any, metadata: dict[str, Any] | None = Non
     """Write nested data to a file that :func:`load_tree` gives back unchanged.
 
     Arrays are written one after the other straight from where they lie. A path is replaced only once the new file is
-    complete and on disk.
+    complete and on disk. Only one process at a time may write to it: what a killed one left half written is removed.
 
     :param path: where to write; missing folders are made. Or a binary file object, open for writing.
     :param tree: dicts (str or int keys), lists and tuples of None, bool, int, float, str, NumPy arrays and scalars, and
@@ -299,7 +300,11 @@ def _read_metadata(archive: zipfile.ZipFile) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _replacing(target: PathOrFile) -> Iterator[IO[bytes]]:
-    """Write beside the target and swap at the end: a crash leaves the old file, never half a file."""
+    """Write beside the target and swap at the end: a crash leaves the old file, never half a file.
+
+    What a write that was killed left beside the target is removed first; with it, that of another process that is
+    writing the same target now, which then fails.
+    """
     if not isinstance(target, (str, os.PathLike)):
         yield target
         return
@@ -307,6 +312,9 @@ def _replacing(target: PathOrFile) -> Iterator[IO[bytes]]:
     if path.is_dir():
         raise ValueError(f"Cannot write to {path}: it is a folder. Give the path of a file.")
     path.parent.mkdir(parents=True, exist_ok=True)
+    for left in path.parent.glob(glob.escape(f".{path.name}.") + "[0-9a-f]" * 8 + ".tmp"):
+        with contextlib.suppress(OSError):  # where it cannot be removed, it is only in the way
+            left.unlink()
     scratch = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
     try:
         with open(scratch, "xb") as file:

@@ -8,6 +8,9 @@ import os
 import pathlib
 import pickle
 import pickletools
+import signal
+import subprocess
+import sys
 import warnings
 import zipfile
 from collections import OrderedDict, deque
@@ -308,6 +311,28 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
         save_tree(path, {"a": th.zeros(3)})
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_a_killed_write_left_is_removed_by_the_next(tmp_path):
+    path = tmp_path / "run[1].zip"
+    script = (
+        "import os, signal, sys\n"
+        "from sb3_said.common import tree_file\n"
+        "tree_file._write_tensors = lambda *_: os.kill(os.getpid(), signal.SIGKILL)\n"
+        "tree_file.save_tree(sys.argv[1], 1)\n"
+    )
+    root = pathlib.Path(tree_file.__file__).parents[2]  # importable from there, installed or not
+    killed = subprocess.run([sys.executable, "-c", script, str(path)], cwd=root, check=False)
+    assert killed.returncode == -signal.SIGKILL
+    (left,) = tmp_path.iterdir()
+    assert left.name.startswith(".run[1].zip.") and left.suffix == ".tmp"
+    others = {tmp_path / name for name in (".run[1].zip.mine.tmp", ".run1.zip.0123abcd.tmp", ".run[1].zip.0123abcd")}
+    for other in others:
+        other.touch()
+    save_tree(tmp_path / "run[2].zip", 2)
+    assert left.exists()  # of another file, which another process may be writing
+    save_tree(path, 3)
+    assert set(tmp_path.iterdir()) == others | {path, tmp_path / "run[2].zip"} and load_tree(path) == 3
 
 
 def test_a_symbolic_link_keeps_pointing(tmp_path):
