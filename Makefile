@@ -28,9 +28,12 @@ $(VENV)/.installed: setup.cfg pyproject.toml constraints.txt scripts/install_tor
 	$(PY) -m pip install -c constraints.txt -e ".[all]"
 	touch $@
 
+# A training that has ended says where it saves; the newest folder may be of another.
+# Ctrl-C is for the training, which then saves what was learned: tee -i outlives it.
 train: install
-	$(PY) scripts/train.py --algo $(ALGO) --env $(ENV) --delay $(DELAY) --preset $(PRESET) -f $(LOGS)
-	run=$$(ls -td $(LOGS)/$(ALGO)/*/ | head -n 1) && \
+	log=$$(mktemp) && \
+	$(PY) -u scripts/train.py --algo $(ALGO) --env $(ENV) --delay $(DELAY) --preset $(PRESET) -f $(LOGS) | tee -i $$log; \
+	run=$$(sed -n 's/^Saving to //p' $$log); rm -f $$log; test -n "$$run" && \
 	$(PY) scripts/evaluate.py "$$run" --episodes $(EPISODES) --plot "$$run/evaluation.png"
 
 test: lint type pytest
