@@ -94,29 +94,30 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         return StackedCritic(**kwargs).to(self.device)
 
     def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
-        """Turn what ``predict`` was given into tensors, after checking it.
+        """Turn what ``predict`` was given into float32 tensors of their own memory, after checking it.
 
-        :param observation: one observation or a batch of them
+        :param observation: one observation or a batch of them, of any numbers
         :return: tensors with a batch dimension, and whether they had one before
-        :raises ValueError: for NaN or infinite entries, another shape, other keys, an age outside 0..max_delay, or a
-            ``state_known`` other than 0 and 1
+        :raises ValueError: for entries that are no numbers or not finite in float32, another shape, an empty batch,
+            other keys, an age outside 0..max_delay, or a ``state_known`` other than 0 and 1
         """
         space = self.observation_space
         if not isinstance(space, spaces.Dict):
             if isinstance(observation, dict):
                 raise ValueError(
-                    f"The agent was built for a task without delay, got a dict with the keys {sorted(observation)}; "
+                    f"The agent was built for a task without delay, got a dict with the keys {list(observation)}; "
                     "leave DelayedObservationWrapper out."
                 )
-            _check_array("observation", np.asarray(observation), space)
-            return super().obs_to_tensor(observation)
+            values = _as_float32("observation", observation)
+            is_batch = _check_array("observation", values, space) is not None
+            return th.as_tensor(values if is_batch else values[None], device=self.device), is_batch
         if not isinstance(observation, dict) or set(observation) != set(space.keys()):
-            given = f"the keys {sorted(observation)}" if isinstance(observation, dict) else type(observation).__name__
+            given = f"the keys {list(observation)}" if isinstance(observation, dict) else type(observation).__name__
             raise ValueError(
                 f"The agent was built for dict observations with the keys {sorted(space.keys())}, got {given}; "
                 "wrap the task in DelayedObservationWrapper."
             )
-        arrays = {key: np.array(observation[key]) for key in space.keys()}
+        arrays = {key: _as_float32(key, observation[key]) for key in space.keys()}
         batches = {key: _check_array(key, values, space[key]) for key, values in arrays.items()}
         if len(set(batches.values())) > 1:
             raise ValueError(f"The parts of an observation differ in how many there are: {batches}.")
@@ -137,8 +138,25 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         }
 
 
+def _as_float32(name: str, values: Any) -> np.ndarray:
+    """Copy numbers to what the networks compute in, before they are looked at.
+
+    1e300 is infinite there, and noise that an observation decides must not depend on the dtype it came in.
+
+    :raises ValueError: for strings and objects, or nested lists that are no array
+    """
+    try:
+        array = np.asarray(values)
+    except ValueError as error:
+        raise ValueError(f"{name} cannot be made an array: {error}") from error
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"{name} holds {array.dtype}, expected real numbers.")
+    with np.errstate(over="ignore"):  # refused with a reason next
+        return array.astype(np.float32)
+
+
 def _check_array(name: str, values: np.ndarray, space: spaces.Space[Any]) -> int | None:
-    """Refuse an array of another shape, or one that is not finite. The bounds of the space are not looked at.
+    """Refuse an array of another shape, an empty batch, or one that is not finite; the bounds of the space are not read.
 
     :return: size of the batch, None for a single element
     """
@@ -147,8 +165,12 @@ def _check_array(name: str, values: np.ndarray, space: spaces.Space[Any]) -> int
             f"{name} has the shape {values.shape}, expected {space.shape}, or (n_envs, *{space.shape}) for a batch; "
             "the agent was built for another task or max_delay."
         )
+    if values.shape != space.shape and len(values) == 0:
+        raise ValueError(f"{name} is an empty batch, of shape {values.shape}; there is nothing to answer.")
     if not np.isfinite(values).all():
-        raise ValueError(f"{name} has entries that are NaN or infinite; find out where they come from first.")
+        raise ValueError(
+            f"{name} has entries that are NaN or infinite, in float32; find out where they come from first."
+        )
     return None if values.shape == space.shape else len(values)
 
 

@@ -22,7 +22,7 @@ from stable_baselines3.common.save_util import save_to_pkl
 from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
-from sb3_said import DelayedObservationWrapper, DelayedSAC
+from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.common.buffers import UNDELAYED
 from sb3_said.common.precision import has_bfloat16
 
@@ -515,6 +515,14 @@ def changed(**parts):
         (changed(undelayed_observation=np.zeros(2, np.float32)), "undelayed_observation"),
         (np.zeros(2, np.float32), "got ndarray"),
         ((observe(), {}), "tuple"),
+        (changed(observation=np.array([0.0, 1e300])), "observation has entries that are NaN or infinite"),
+        (changed(observation=np.array(["0.5", "a"])), "observation holds <U3, expected real numbers"),
+        (changed(observation=np.array([0.5, None])), "observation holds object, expected real numbers"),
+        (changed(action_history=[["0.5"], ["0.5"]]), "action_history holds <U3, expected real numbers"),
+        (changed(delay=[None]), "delay holds object, expected real numbers"),
+        (changed(observation=[0.5, [0.5]]), "observation cannot be made an array"),
+        ({key: value[None][:0] for key, value in observe().items()}, "empty batch"),
+        ({**observe(), 3: np.zeros(2)}, "with the keys"),
     ],
 )
 def test_bad_observations_are_refused_before_anything_is_computed(obs, message, deterministic, monkeypatch):
@@ -537,8 +545,50 @@ def test_bad_observations_are_refused_before_anything_is_computed(obs, message, 
         (np.zeros(3), r"shape \(3,\), expected \(2,\)"),
         (np.zeros((2, 3, 2)), "shape"),
         (observe(), "without delay"),
+        ({3: 0, "a": 0}, "without delay"),
+        (np.array([0.0, 1e300]), "NaN or infinite"),
+        (["0.5", "0.5"], "observation holds <U3, expected real numbers"),
+        ([0.5, None], "observation holds object, expected real numbers"),
+        (None, "observation holds object, expected real numbers"),
+        ([0.5, [0.5]], "observation cannot be made an array"),
+        (np.zeros((0, 2)), "empty batch"),
     ],
 )
 def test_bad_observations_are_refused_without_delay_too(obs, message):
     with pytest.raises(ValueError, match=message):
         make(Drift()).predict(obs)
+
+
+def own_dtypes(obs):
+    """Yield what a user may hand in for the same float32 observations: other dtypes, lists, other layouts in memory."""
+    yield {key: value.astype(np.float64) for key, value in obs.items()}
+    yield {key: value.astype(np.int64) if key == "delay" else value for key, value in obs.items()}
+    yield {key: value.tolist() for key, value in obs.items()}
+    yield {key: np.asfortranarray(value) for key, value in obs.items()}
+    yield {key: np.flip(np.flip(value).copy()) for key, value in obs.items()}
+    yield {key: np.frombuffer(value.tobytes(), np.float32).reshape(value.shape) for key, value in obs.items()}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("make_env", [Drift, delayed], ids=["plain", "delayed"])
+@pytest.mark.parametrize("cls", [DelayedSAC, SAID])
+@pytest.mark.parametrize("batch", [False, True])
+def test_the_same_numbers_get_the_same_answer_in_any_dtype(make_env, cls, batch):
+    planner = {"d_model": 32, "depth": 1, "horizon": 3, "sampling_steps": 2, "n_candidates": 4, "temperature": 0.5}
+    planner = {"planner_kwargs": planner, "planner_gradient_steps": 2} if cls is SAID else {}
+    model = make(make_env(), cls=cls, **planner).learn(40)
+    assert cls is DelayedSAC or model.policy.planner_is_trained
+    obs = observe()
+    if batch:
+        obs = {key: np.stack([value, value, value]) for key, value in obs.items()}
+    if make_env is Drift:
+        obs = {"observation": obs["observation"]}
+
+    def answer(obs):
+        return model.predict(obs if make_env is delayed else obs["observation"], deterministic=True)[0]
+
+    expected, before = answer(obs), copy.deepcopy(obs)
+    for same in own_dtypes(obs):
+        np.testing.assert_array_equal(answer(same), expected)
+    for key in obs:
+        np.testing.assert_array_equal(obs[key], before[key])
