@@ -22,9 +22,11 @@ N_NORMALIZER_WINDOWS = 10_000  # enough for a standard deviation to a percent
 
 
 def learning_rate(step: int, gradient_steps: int, config: PlannerConfig) -> float:
-    """Return the learning rate of update ``step`` = 0, 1, ...: a linear rise, then a cosine down to 0."""
+    """Return the learning rate of update ``step`` = 0, 1, ...: a linear rise, then a cosine down to 0, or no change."""
     if step < config.warmup_steps:
         return config.learning_rate * (step + 1) / config.warmup_steps
+    if config.lr_schedule == "constant":
+        return config.learning_rate
     progress = (step - config.warmup_steps) / max(1, gradient_steps - config.warmup_steps)
     return config.learning_rate * (0.5 + 0.5 * math.cos(math.pi * min(1.0, progress)))
 
@@ -32,8 +34,11 @@ def learning_rate(step: int, gradient_steps: int, config: PlannerConfig) -> floa
 def ema_decay(step: int, config: PlannerConfig) -> float:
     """Return the decay of the averaged weights after update ``step`` = 0, 1, ...
 
-    It rises to its full value, because a full-length average still holds mostly initial weights in a short run.
+    With ``ema_warmup`` it rises to its full value, because a full-length average still holds mostly initial weights in
+    a short run.
     """
+    if not config.ema_warmup:
+        return config.ema_decay
     return min(config.ema_decay, (1 + step) / (10 + step))
 
 
@@ -61,7 +66,7 @@ class PlannerTrainer:
 
     :param planner: trained in place; its normaliser is fitted to the training part of ``source``
     :param source: windows of the true, undelayed states and the actions
-    :param gradient_steps: updates of the whole training, over which the learning rate falls to 0
+    :param gradient_steps: updates of the whole training, over which a cosine learning rate falls to 0
     :param held_out: fraction of the data, in whole episodes, that is kept for ``evaluate``; 0 for none
     :param seed: of every draw
     :raises ValueError: when ``source`` does not fit the planner, or cannot be split

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import json
 import math
 
@@ -78,6 +79,71 @@ def test_learning_rate_is_linear_then_cosine():
     np.testing.assert_allclose(rates[:10], np.arange(1, 11) / 5)
     np.testing.assert_allclose(rates[10:], 1 + np.cos(np.pi * np.arange(101) / 100), atol=1e-12)
     assert learning_rate(0, 1, PlannerConfig(learning_rate=2.0, warmup_steps=0)) == 2.0
+
+
+def test_a_constant_learning_rate_stays_after_its_warm_up():
+    config = PlannerConfig(lr_schedule="constant", learning_rate=2.0, warmup_steps=4)
+    assert [learning_rate(step, 9, config) for step in range(9)] == [0.5, 1.0, 1.5, *[2.0] * 6]
+
+
+def test_an_average_without_warm_up_is_a_full_length_one_from_the_start():
+    assert [ema_decay(step, PlannerConfig.paper()) for step in (0, 1, 10_000)] == [0.9999] * 3
+
+
+#: Another value of every setting.
+OTHER_SETTINGS = {
+    "depth": 2,
+    "d_model": 64,
+    "horizon": 4,
+    "positions": "learned",
+    "embed_known": False,
+    "prediction": "epsilon",
+    "schedule": "linear",
+    "time_sampling": "uniform",
+    "mask": "fixed",
+    "mask_end_probability": 0.0,
+    "extra_state_probability": 0.9,
+    "relative_states": False,
+    "decision_weight": 1.0,
+    "action_transform": "tanh",
+    "solver": "dpmsolver++2m",
+    "time_grid": "log_snr",
+    "sampling_steps": 4,
+    "n_candidates": 3,
+    "temperature": 0.5,
+    "scored_states": "all",
+    "learning_rate": 3e-3,
+    "lr_schedule": "constant",
+    "warmup_steps": 2,
+    "weight_decay": 0.5,
+    "betas": (0.5, 0.9),
+    "batch_size": 8,
+    "gradient_clip": 1e-3,
+    "ema_decay": 0.05,
+    "ema_warmup": False,
+    "weight_factor": 0.5,
+    "precision": "bfloat16",
+}
+
+
+@pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(PlannerConfig)])
+def test_every_setting_matters(name):
+    def train_and_plan(**config):
+        trainer = make_trainer(
+            **{"precision": "float32", "temperature": 1.0, "n_candidates": 16, "sampling_steps": 3, **config}
+        )
+        trainer.train()
+        generator = th.Generator().manual_seed(0)
+        observation, history = th.ones(4, STATE_DIM), th.zeros(4, D, ACTION_DIM)
+
+        def value(states, actions):  # (..., obs_dim), (..., act_dim) -> (...)
+            return (20 * states).sin().sum(-1) + actions.sum(-1)
+
+        plan = trainer.planner.plan(observation, history, th.arange(4), value_fn=value, generator=generator)
+        return np.concatenate([plan.action.ravel(), plan.present.ravel()])
+
+    assert not np.array_equal(train_and_plan(), train_and_plan(**{name: OTHER_SETTINGS[name]}))
+    assert np.array_equal(train_and_plan(), train_and_plan())
 
 
 def test_optimizers_follow_the_schedule():
