@@ -10,6 +10,8 @@ import numpy as np
 
 from sb3_said.delays.processes import (
     DelayProcess,
+    EpisodeDelay,
+    FixedDelay,
     check_count,
     check_draw,
     check_probability,
@@ -157,3 +159,14 @@ class TotalDelay:
             )
         k = check_draw(added, action, action.max_delay)
         return (None if delay is None else delay + k for delay in packet_delays(observation, rng))
+
+
+def fixed_delay(process: int | tuple[int, int] | DelayProcess) -> int | None:
+    """Return the delay of a process that has the same one in every episode; None for others, and for a user's own."""
+    process = make_process(process)
+    if isinstance(process, TotalDelay):
+        parts = fixed_delay(process.observation), fixed_delay(process.action)
+        return None if None in parts else sum(part for part in parts if part is not None)
+    if isinstance(process, (FixedDelay, EpisodeDelay)):
+        return process.max_delay if isinstance(process, FixedDelay) or process.low == process.high else None
+    return None

@@ -138,7 +138,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
         if obs is not None and not self.replay_buffer.knows_past(obs).all():  # emptied, or not loaded with the agent
             self._last_obs = None  # SB3 then resets the environments
         learn = super()._setup_learn(*args, **kwargs)
-        self.trained_delay = _written(_process_of(self.env))
+        self.trained_delay = _written(process_of(self.env))
         return learn
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
@@ -158,11 +158,11 @@ class DelayedSAC(SafeSaveMixin, SAC):
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Take another environment, as SB3 does; see :meth:`check_delay` for one with another delay."""
         super().set_env(env, force_reset)
-        self.check_delay(_process_of(self.env))
+        self.check_delay(process_of(self.env))
 
     def _check_loaded(self) -> None:
         if self.env is not None:
-            self.check_delay(_process_of(self.env))
+            self.check_delay(process_of(self.env))
 
     def check_delay(self, process: DelayProcess | None) -> None:
         """Warn where an agent that was trained under one delay is to act under another.
@@ -172,7 +172,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
         :param process: makes the delays that it will meet; None where nothing is delayed
         """
         delay = _written(process)
-        if self.trained_delay is None or delay == self.trained_delay or self._serves_every_delay():
+        if self.trained_delay is None or delay == self.trained_delay or self._serves(process):
             return
         warnings.warn(
             f"This {type(self).__name__} learned under {self.trained_delay} and is given {delay}: what it does at ages "
@@ -180,8 +180,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
             stacklevel=3,
         )
 
-    def _serves_every_delay(self) -> bool:
-        """Tell whether answers are as good at ages that training did not bring."""
+    def _serves(self, process: DelayProcess | None) -> bool:
+        """Tell whether answers are as good under delays that training did not bring."""
         return False
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
@@ -285,7 +285,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
         self.replay_buffer.load_state_dict(state)
 
 
-def _process_of(env: VecEnv | None) -> DelayProcess | None:
+def process_of(env: VecEnv | None) -> DelayProcess | None:
+    """Return what makes the delays of an environment, None where nothing is delayed."""
     # Asked for first: a missing attribute ends the workers of a SubprocVecEnv. A plain task may have one of its own.
     if env is None or not isinstance(env.observation_space, spaces.Dict) or not env.has_attr("process"):
         return None

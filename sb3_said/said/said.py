@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import asdict, replace
 from typing import Any, ClassVar, TypeVar
 
@@ -15,9 +16,12 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import configure_logger
 
 from sb3_said.common.buffers import has_state_history
+from sb3_said.delays.combined import fixed_delay
+from sb3_said.delays.processes import DelayProcess
 from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.sac import DelayedSAC
+from sb3_said.sac.delayed_sac import process_of
 from sb3_said.said.callbacks import PlannerTrainingCallback
 from sb3_said.said.policies import SAIDPolicy
 
@@ -90,6 +94,8 @@ class SAID(DelayedSAC):
     def _setup_model(self) -> None:
         super()._setup_model()
         self._planner_settings = asdict(self.policy.planner.config)
+        if self.env is not None and (reason := self._why_no_answer(process_of(self.env))):
+            warnings.warn(reason, stacklevel=3)
 
     def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:
         """Keep this agent's own planner where the given one was never trained and has other settings."""
@@ -148,9 +154,28 @@ class SAID(DelayedSAC):
         self.planner_kwargs = {**(self.planner_kwargs or {}), **settings}
         self.policy.planner_kwargs = {**self.policy.planner_kwargs, **settings}
 
-    def _serves_every_delay(self) -> bool:
-        # Its masks were drawn from all of 0..D, over true states that replay has at every age
-        return self.policy.planner_is_trained and self.policy.planner.config.mask == "random"
+    def check_delay(self, process: DelayProcess | None) -> None:
+        """Refuse delays under which the planner, once trained, has no answer; warn where the expert knows none.
+
+        :param process: makes the delays that it will meet; None where nothing is delayed
+        :raises ValueError: for a planner with ``mask="fixed"``, which answers at age ``max_delay`` only, under others
+        """
+        if self.policy.planner_is_trained and (reason := self._why_no_answer(process)):
+            raise ValueError(reason)
+        super().check_delay(process)
+
+    def _why_no_answer(self, process: DelayProcess | None) -> str | None:
+        delay, max_delay = 0 if process is None else fixed_delay(process), self.policy.max_delay
+        if self.policy.planner.config.mask == "random" or delay == max_delay:
+            return None
+        return (
+            f"A planner with mask='fixed' answers under delay={max_delay} only, but this environment has {process}; "
+            "train one with mask='random', which serves every delay up to the largest."
+        )
+
+    def _serves(self, process: DelayProcess | None) -> bool:
+        # Masks were drawn from all of 0..D, over true states that replay has at every age
+        return self.policy.planner_is_trained and self._why_no_answer(process) is None
 
     def warmup(self, batch_size: int = 1) -> None:
         """Answer a few times for nothing: see :meth:`SAIDPolicy.warmup`. A control loop calls it once before it starts.

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from random_processes import N, draw_packets, frequencies, processes
 
 from sb3_said.delays import DroppedPackets, FixedDelay, HeldDelay, PeriodicPackets, TotalDelay, UniformDelay
+from sb3_said.delays.combined import fixed_delay
 from sb3_said.delays.processes import packet_delays
 
 
@@ -99,3 +100,15 @@ def test_observations_take_as_long_with_action_delay_as_without(process, low, sp
     assert [x is None for x in alone] == [x is None for x in total]
     assert len(added) <= 1 and added <= set(range(low, low + spread + 1))
     assert TotalDelay(process, (low, low + spread)).max_delay == process.max_delay + low + spread
+
+
+@settings(deadline=None)
+@given(processes(), processes(), st.integers(0, 2**16))
+def test_a_fixed_delay_is_that_of_every_packet(observation, action, seed):
+    for process in (observation, TotalDelay(observation, action)):
+        delay = fixed_delay(process)
+        if delay is not None:
+            assert set(draw_packets(process, 30, seed).tolist()) == {delay}
+    for process in (3, (3, 3), TotalDelay(1, (2, 2))):
+        assert fixed_delay(process) == 3
+    assert fixed_delay((2, 3)) is None and fixed_delay(TotalDelay(1, (2, 3))) is None

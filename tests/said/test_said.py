@@ -19,7 +19,7 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC, PlannerConfig
-from sb3_said.delays import UniformDelay
+from sb3_said.delays import TotalDelay, UniformDelay
 
 PLANNER = {
     "d_model": 32,
@@ -419,12 +419,29 @@ def test_only_a_planner_of_every_delay_takes_another_one_silently(trained, saved
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         SAID.load(saved, env=delayed((0, 2)), device="cpu")
-    fixed, without_planner = make(planner_kwargs={"mask": "fixed"}).learn(80), make().learn(80)
+    without_planner = make().learn(80)
     without_planner.policy.planner_updates.zero_()
-    for agent in (fixed, without_planner):
-        agent.save(tmp_path / "agent")
-        with pytest.warns(UserWarning, match=r"SAID learned under FixedDelay\(delay=2\) and is given EpisodeDelay"):
-            SAID.load(tmp_path / "agent", env=delayed((0, 2)), device="cpu")
+    without_planner.save(tmp_path / "agent")
+    with pytest.warns(UserWarning, match=r"SAID learned under FixedDelay\(delay=2\) and is given EpisodeDelay"):
+        SAID.load(tmp_path / "agent", env=delayed((0, 2)), device="cpu")
+
+
+@pytest.mark.parametrize("delay", [(0, 2), 1, UniformDelay(1, 2)])
+def test_a_planner_for_one_age_refuses_environments_of_others(delay, tmp_path):
+    with pytest.warns(UserWarning, match="mask='fixed' answers under delay=2 only"):  # the expert may learn there
+        make(delayed(delay, max_delay=2), planner_kwargs={"mask": "fixed"})
+    model = make(planner_kwargs={"mask": "fixed"}).learn(60)
+    model.save(tmp_path / "agent")
+    for take in (
+        lambda: model.set_env(make_vec_env(lambda: delayed(delay, max_delay=2))),
+        lambda: SAID.load(tmp_path / "agent", env=delayed(delay, max_delay=2), device="cpu"),
+    ):
+        with pytest.raises(ValueError, match="mask='fixed' answers under delay=2 only, but this environment"):
+            take()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for same in (2, (2, 2), TotalDelay(1, (1, 1))):
+            SAID.load(tmp_path / "agent", env=delayed(same), device="cpu")
 
 
 def test_parameters_and_policy_are_taken_over(trained, tmp_path):
