@@ -11,7 +11,7 @@ from gymnasium import spaces
 
 from sb3_said.delays.actuator import Actuator
 from sb3_said.delays.combined import TotalDelay
-from sb3_said.delays.processes import DelayProcess, make_process
+from sb3_said.delays.processes import DelayProcess, check_count, make_process
 from sb3_said.delays.receivers import RECEIVERS
 
 #: Keeps the delays' random numbers apart from those that the task draws from the same seed.
@@ -110,6 +110,7 @@ class DelayedObservationWrapper(
             make_process(delay) if action_delay == 0 else TotalDelay(make_process(delay), make_process(action_delay))
         )
         self.max_delay = self.process.max_delay if max_delay is None else max_delay
+        check_count("max_delay", self.max_delay, 0)
         if self.max_delay < self.process.max_delay:
             raise ValueError(f"max_delay={max_delay} is smaller than the largest delay {self.process.max_delay}.")
         if receiver not in RECEIVERS:
@@ -120,7 +121,8 @@ class DelayedObservationWrapper(
             self.actuator = Actuator(RECEIVERS[receiver](make_process(self.process.action)), observed.max_delay)
         self.receiver = RECEIVERS[receiver](observed)
 
-        self._action_low, self._action_span = act_space.low, act_space.high - act_space.low
+        self._action_low = act_space.low.astype(np.float64)  # whose span the bounds' own type may not hold
+        self._action_span = act_space.high.astype(np.float64) - self._action_low
         self._action_is_scaled = bool(np.all(act_space.low == -1) and np.all(act_space.high == 1))
         with np.errstate(over="ignore"):  # a float64 bound beyond float32 becomes infinite
             low, high = (bound.astype(np.float32) for bound in (obs_space.low, obs_space.high))

@@ -254,6 +254,19 @@ def test_history_holds_what_was_executed():
         np.testing.assert_array_equal(obs["action_history"], [scaled])
 
 
+@pytest.mark.parametrize(
+    "space",
+    [spaces.Box(-100, 100, (1,), np.int8), spaces.Box(-128, 127, (1,), np.int8), spaces.Box(-3e38, 3e38, (1,))],
+)
+def test_bounds_whose_span_their_own_type_cannot_hold(space):
+    task = LoggedTask()
+    task.action_space = space
+    env = DelayedObservationWrapper(task, 1)
+    env.reset(seed=0)
+    for action, scaled in ((space.low, -1), (space.high, 1), (space.high // 2, 0.5)):
+        np.testing.assert_allclose(env.step(action)[0]["action_history"], [[scaled]], atol=0.01)
+
+
 def test_history_is_bit_for_bit_the_action_where_bounds_are_one():
     env = DelayedObservationWrapper(LoggedTask(low=-np.ones(2, np.float32), high=np.ones(2, np.float32)), 1)
     env.reset(seed=0)
@@ -365,6 +378,9 @@ def test_wrapping_twice_is_refused():
 def test_max_delay_below_the_delay_is_refused():
     with pytest.raises(ValueError, match="max_delay=3 is smaller than the largest delay 4"):
         DelayedObservationWrapper(LoggedTask(), (0, 4), max_delay=3)
+    for bad in (4.5, "5", -1):
+        with pytest.raises(ValueError, match=f"max_delay is a whole number >= 0, got {bad}"):
+            DelayedObservationWrapper(LoggedTask(), 0, max_delay=bad)
 
 
 # ---------------------------------------------------------------------------------------------------- action delay
