@@ -176,10 +176,10 @@ class DelayedReplayBuffer(ReplayBuffer):
                 f"{obs['delay'][env, 0]:.0f} steps old: transitions must be added in the order they happened. Empty or "
                 "replace a replay between two calls of learn(), which then starts new episodes, not during one."
             )
-        one_later = np.all(next_obs["action_history"][:, :-1] == history[:, 1:], axis=(1, 2))
-        if not one_later.all():  # a step between the two was not added, or not taken
+        differs = next_obs["action_history"][:, :-1] != history[:, 1:]
+        if differs.any():  # a step between the two was not added
             raise ValueError(
-                f"The observation after the action of environment {np.flatnonzero(~one_later)[0]} does not follow the "
+                f"The observation after the action of environment {np.argwhere(differs)[0, 0]} does not follow the "
                 "one before it: its action_history is not the same with one action more. Transitions must be added in "
                 "the order they happened, and each of them."
             )

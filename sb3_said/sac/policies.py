@@ -156,7 +156,7 @@ def _as_float32(name: str, values: Any) -> np.ndarray:
 
 
 def _check_array(name: str, values: np.ndarray, space: spaces.Space[Any]) -> int | None:
-    """Refuse an array of another shape, an empty batch, or one that is not finite; the bounds of the space are not read.
+    """Refuse an array of another shape, an empty batch or one that is not finite. The space's bounds are not read.
 
     :return: size of the batch, None for a single element
     """
