@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,6 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from tqdm.auto import tqdm
 
 from sb3_said.common.save_util import load_tree, save_tree
+from sb3_said.planner.trainer import worse_than_regression
 
 if TYPE_CHECKING:
     from sb3_said.said.said import SAID
@@ -94,6 +96,12 @@ class PlannerTrainingCallback(BaseCallback):
                     for key, value in {**losses, **errors, "planner/n_updates": done}.items():
                         model.logger.record(key, value)
                     model.logger.dump(model.num_timesteps + done)
+                    if done == total and (worse := worse_than_regression(errors)):
+                        warnings.warn(
+                            f"On held-out windows the planner is still worse than a small regression: {worse}. It is "
+                            "undertrained; give it more planner_gradient_steps, or more data.",
+                            stacklevel=2,
+                        )
                 if self.checkpoint is not None and (done % self.save_interval == 0 or done == total):
                     save_tree(self.checkpoint, {**data, "trainer": trainer.state_dict()})
         except KeyboardInterrupt:

@@ -35,7 +35,7 @@ class SAID(DelayedSAC):
 
     ``learn`` runs the expert (SADR), then trains a diffusion transformer on windows of its replay buffer. ``predict``
     asks the expert until the planner is trained, and the planner from then on: it inpaints what the delay hides and the
-    plan behind it, many times, and the critics choose. Collection always uses the expert.
+    plan behind it; at a temperature above 0 many times, and the critics choose. Collection always uses the expert.
 
     :param policy: ``"MultiInputPolicy"`` or ``"MlpPolicy"``, which name the same class
     :param env: a task in a ``DelayedObservationWrapper``, or one with a 1-D Box observation (delay 0)

@@ -16,7 +16,7 @@ from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner.diffusion import alpha_sigma, draw_times
 from sb3_said.planner.dit import HEAD_DIM
 from sb3_said.planner.inpainting import draw_delays
-from sb3_said.planner.trainer import PlannerTrainer, ema_decay, learning_rate, value_weight
+from sb3_said.planner.trainer import PlannerTrainer, ema_decay, learning_rate, value_weight, worse_than_regression
 
 D = 3
 
@@ -440,6 +440,18 @@ def test_delay_zero_planner_trains():
     trainer = make_trainer(max_delay=0)
     trainer.train()
     assert trainer.evaluate()["planner/action_error_d0"] > 0
+
+
+def test_what_a_planner_is_worse_at_is_named():
+    errors = {"planner/present_error_d0": 0.0, "planner/present_error_d4": 0.31, "planner/action_error_d4": 0.204}
+    bars = {
+        "planner/present_error_mlp_d0": 0.0,
+        "planner/present_error_mlp_d4": 0.2,
+        "planner/action_error_mlp_d4": 0.2,
+    }
+    assert worse_than_regression(errors | bars) == "present_error_d4 0.31 against 0.2"
+    assert worse_than_regression(errors | bars, tolerance=0.0).endswith(", action_error_d4 0.204 against 0.2")
+    assert worse_than_regression({}) == ""
 
 
 def test_infinite_loss_names_its_update(monkeypatch):

@@ -1,6 +1,7 @@
 """Training the planner: when, on what, with what to watch it by, and on from where it was interrupted."""
 
 import io
+import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -68,6 +69,18 @@ def trainings(monkeypatch):
 def begun(trainings):
     """Return the stored steps that each training began with."""
     return [trainer._settings["n_windows"] for trainer in trainings]
+
+
+@pytest.mark.parametrize("is_worse", [False, True])
+def test_a_planner_worse_than_the_regression_is_not_called_done(is_worse, monkeypatch):
+    model = make().learn(60)
+    errors = {"planner/present_error_d2": 1.0 + is_worse, "planner/present_error_mlp_d2": 1.0}
+    monkeypatch.setattr(PlannerTrainer, "evaluate", lambda self: errors)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model.train_planner()
+    told = [str(w.message) for w in caught if "worse than a small regression" in str(w.message)]
+    assert len(told) == is_worse and all("present_error_d2 2 against 1" in message for message in told)
 
 
 def interrupt_at(monkeypatch, update, error):
