@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import gymnasium as gym
@@ -155,6 +156,27 @@ def test_enjoy_prints_every_episode(run: Path, tmp_path: Path, capsys: pytest.Ca
     enjoy.main([str(run), "--record", str(film), "--episodes", "2", "--answer", "expert", "--device", "cpu"])
     out = capsys.readouterr().out
     assert "seed 10000: return" in out and "seed 10001: return" in out and film.stat().st_size > 0
+
+
+def test_enjoy_draws_an_mp4(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                            capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
+    imageio = pytest.importorskip("imageio")
+    pytest.importorskip("imageio_ffmpeg")
+    monkeypatch.setenv("MUJOCO_GL", os.environ.get("MUJOCO_GL", "egl"))
+    env = gym.make(ENV, render_mode="rgb_array")
+    env.reset()
+    try:
+        env.render()
+    except Exception as error:  # each graphics library fails in its own way
+        pytest.skip(f"nothing can be drawn here: {error!r}")
+    finally:
+        env.close()
+    film = tmp_path / "film.mp4"
+    enjoy.main([str(run), "--record", str(film), "--answer", "expert", "--device", "cpu"])
+    with imageio.get_reader(film) as reader:
+        frames = [frame for frame in reader.iter_data()]  # list() would ask for a length, which is infinite
+    assert f"{len(frames)} frames" in capsys.readouterr().out
+    assert all(frame.shape == (480, 480, 3) and frame.std() > 10 for frame in frames)  # a picture, not a blank
 
 
 @pytest.mark.parametrize(("env_id", "camera"), [("Hopper-v5", 0), ("InvertedPendulum-v5", -1)])

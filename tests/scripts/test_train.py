@@ -96,10 +96,15 @@ def test_a_killed_run_goes_on_from_its_checkpoint_twice_alike(tmp_path: Path) ->
     assert steps.tolist() == [300, 600]
 
 
+def in_folder(folder: Path, command: str, *more: str | Path) -> list[str]:
+    """Return the words of a command line with what makes it quick and quiet."""
+    common = ["--num-threads", "1", "--eval-freq", "-1", "--device", "cpu", "--verbose", "0", "-f", folder]
+    return [*command.split(), *map(str, [*common, *more])]
+
+
 def train_here(folder: Path, command: str, *more: str | Path) -> None:
     """Train in this process, which is quicker than in one of its own."""
-    common = ["--num-threads", "1", "--eval-freq", "-1", "--device", "cpu", "--verbose", "0", "-f", folder]
-    train.main([*command.split(), *map(str, [*common, *more])])
+    train.main(in_folder(folder, command, *more))
 
 
 def config_of(run: Path) -> dict[str, Any]:
@@ -156,11 +161,57 @@ def test_episodes_after_the_checkpoint_are_not_counted_twice(tmp_path: Path) -> 
         assert sum(now) <= 160 and now[len(before[k])] != 70
 
 
+def test_flags_of_rl_zoo3_work_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command, agent = "--algo sadr --env Pendulum-v1 --delay 1 --preset smoke -n 120 --save-replay-buffer", "Pendulum-v1"
+    board, params = tmp_path / "board", ["-params", "learning_starts:60"]
+    train_here(tmp_path, f"{command} --vec-env subproc -P --save-freq 50", "-tb", board, *params)
+    assert "120/120" in "".join(capsys.readouterr())  # -P
+    first, second = (tmp_path / "sadr" / f"Pendulum-v1-delay1_{k}" for k in (1, 2))
+    assert {path.name for path in first.glob("rl_model_*.zip")} == {f"rl_model_{n}_steps.zip" for n in (50, 100)}
+    assert list(board.glob("Pendulum-v1/Pendulum-v1-delay1_1/events.*"))
+
+    # -i finds the replay beside the agent, and goes on adding to it.
+    train_here(tmp_path, command, "-i", first / f"{agent}.zip", *params)
+    model = DelayedSAC.load(second / agent)
+    model.load_replay_buffer(second / "replay_buffer.pkl")
+    assert model.replay_buffer is not None and model.replay_buffer.size() == 240
+
+
 def test_optimize_searches_and_writes_its_trials(tmp_path: Path) -> None:
     command = "--algo sadr --env Pendulum-v1 --delay 1 --preset smoke -n 20 --seed 3 --eval-episodes 1"
     train_here(tmp_path, command, *"-optimize --n-trials 1 --n-evaluations 1 --no-optim-plots".split())
     (table,) = (tmp_path / "sadr").glob("report_*.csv")
     assert "params_learning_rate" in table.read_text().splitlines()[0]
+
+
+# train.py with checkpoints of the planner every 10 updates, not 1,000, that kills itself at the 15th.
+KILLED_AMID_UPDATES = f"""
+import functools, os, signal, sys
+sys.path.insert(0, {str(SCRIPTS)!r})
+import train, zoo
+from sb3_said.planner.trainer import PlannerTrainer
+
+def step(trainer, original=PlannerTrainer.step):
+    if trainer.n_updates == 15:
+        os.kill(os.getpid(), signal.SIGKILL)
+    original(trainer)
+
+PlannerTrainer.step = step
+zoo.PlannerTrainingCallback = functools.partial(zoo.PlannerTrainingCallback, save_interval=10)
+train.main(sys.argv[1:])
+"""
+
+
+def test_a_run_killed_amid_the_planners_updates_ends_as_if_it_was_not(finished: Path, tmp_path: Path) -> None:
+    killed = subprocess.run([sys.executable, "-c", KILLED_AMID_UPDATES, *arguments(tmp_path)], capture_output=True)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    folder = tmp_path / "said" / "InvertedPendulum-v5-delay2_1"
+    assert load_tree(folder / "planner_checkpoint.zip")["trainer"]["n_updates"] == 10
+    run("--resume", folder)
+    left, right = (
+        SAID.load(each / "InvertedPendulum-v5.zip").get_parameters()["policy"] for each in (finished, folder)
+    )
+    assert all((left[key] == right[key]).all() for key in left)
 
 
 def test_the_delay_range_and_its_flags_reach_the_run(tmp_path: Path) -> None:

@@ -212,20 +212,23 @@ def test_what_yaml_cannot_hold_is_named() -> None:
     assert left_out == ["policy_kwargs"]
 
 
-def test_two_workers_share_a_study_and_train_no_depth_twice(run: Path) -> None:
-    command = [sys.executable, str(SCRIPT), "--run", str(run), "--depths", "2", "3", "--temperatures", "0", "1", *QUICK]
+@pytest.mark.parametrize("storage", [[], ["--storage", "sqlite:///{}/study.db"]], ids=["journal", "sqlite"])
+def test_two_workers_share_a_study_and_train_no_depth_twice(run: Path, storage: list[str]) -> None:
+    grid = ["--depths", "2", "3", "--temperatures", "0", "1"]
+    command = [sys.executable, str(SCRIPT), "--run", str(run), *grid, *QUICK, *(word.format(run) for word in storage)]
     environ = {**os.environ, "OMP_NUM_THREADS": "1"}
     workers = [
         subprocess.Popen(command, env=environ, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
         for _ in range(2)
     ]
-    outputs = [worker.communicate(timeout=120)[0] for worker in workers]
+    outputs = [worker.communicate(timeout=240)[0] for worker in workers]
     assert [worker.returncode for worker in workers] == [0, 0], outputs
     assert sum(out.count("Training the planner of depth 2") for out in outputs) == 1, outputs
     assert sum(out.count("Training the planner of depth 3") for out in outputs) == 1, outputs
     trials = json.loads((run / "tune" / "results.json").read_text())["trials"]
     assert len(trials) == 4 and len({(t["depth"], t["temperature"]) for t in trials}) == 4
     assert not list((run / "tune" / "locks").iterdir())
+    assert (run / "study.db" if storage else run / "tune" / "study.log").exists()
 
 
 def make_planners(run: Path, folder: Path, steps: int) -> DepthPlanners:
