@@ -209,7 +209,7 @@ class SafeSaveMixin(BaseAlgorithm):
         _check_data(data, kwargs)
         if env is not None:
             env = cls._wrap_env(env, data.get("verbose", 0))
-            check_for_correct_spaces(env, data["observation_space"], data["action_space"])
+            cls._check_spaces(env, data["observation_space"], data["action_space"])
             if force_reset:
                 data["_last_obs"] = None
             data["n_envs"] = env.num_envs
@@ -233,6 +233,11 @@ class SafeSaveMixin(BaseAlgorithm):
             model.policy.reset_noise()  # type: ignore[operator]
         model._check_loaded()
         return model
+
+    @classmethod
+    def _check_spaces(cls, env: GymEnv, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
+        """:raises ValueError: for an environment of other spaces than the agent's"""
+        check_for_correct_spaces(env, observation_space, action_space)
 
     def _check_loaded(self) -> None:
         """Look at an agent that was just loaded, and at its environment where it was given one."""

@@ -22,7 +22,7 @@ from stable_baselines3.common.type_aliases import (
 from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_said.common.buffers import DelayedReplayBuffer
+from sb3_said.common.buffers import DelayedReplayBuffer, check_spaces
 from sb3_said.common.checks import check_choice
 from sb3_said.common.precision import PRECISIONS, autocast
 from sb3_said.common.save_util import PickleRefusedError, SafeSaveMixin, explained_refusal, load_tree, save_tree
@@ -157,8 +157,19 @@ class DelayedSAC(SafeSaveMixin, SAC):
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Take another environment, as SB3 does; see :meth:`check_delay` for one with another delay."""
+        self._check_spaces(env, self.observation_space, self.action_space)
         super().set_env(env, force_reset)
         self.check_delay(process_of(self.env))
+
+    @classmethod
+    def _check_spaces(cls, env: GymEnv, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
+        own, given = (check_spaces(space, action_space)[1] for space in (observation_space, env.observation_space))
+        if own != given:
+            raise ValueError(
+                f"This {cls.__name__} was built for max_delay={own}, but this environment has max_delay={given}; "
+                f"where its delays allow, give it DelayedObservationWrapper(..., max_delay={own})."
+            )
+        super()._check_spaces(env, observation_space, action_space)
 
     def _check_loaded(self) -> None:
         if self.env is not None:
