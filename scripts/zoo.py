@@ -25,7 +25,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC, PlannerTrainingCallback
 from sb3_said.common.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback, restore_training
-from sb3_said.delays.processes import FixedDelay, make_process
+from sb3_said.delays.combined import fixed_delay
+from sb3_said.delays.processes import make_process
 
 #: A delay as YAML has it: control steps, [low, high], or a process as text; None for a task without the wrapper.
 Delay = int | list[int] | str | None
@@ -96,7 +97,7 @@ def largest_delay(delay: Delay) -> int:
 
 def varies(delay: Delay) -> bool:
     """Say whether a delay is another one in each episode, or at each step."""
-    return delay is not None and not isinstance(make_process(delay), FixedDelay)
+    return delay is not None and fixed_delay(make_process(delay)) is None
 
 
 def preset_overrides(config: str | Path, preset: str, env_id: str, delay: Delay) -> dict[str, Any]:
