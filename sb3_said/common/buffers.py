@@ -311,7 +311,7 @@ class DelayedReplayBuffer(ReplayBuffer):
         self,
         newest_fraction: float = 1.0,
         gamma: float = 0.99,
-        terminal_penalty: float = -100.0,
+        terminal_penalty: float | None = -100.0,
         value_fn: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
         env: VecNormalize | None = None,
     ) -> WindowSource:
@@ -321,7 +321,7 @@ class DelayedReplayBuffer(ReplayBuffer):
 
         :param newest_fraction: use only the newest part of the buffer (the paper's 20 % is 0.2), in (0, 1]
         :param gamma: discount of the windows' values
-        :param terminal_penalty: replaces the reward of a terminating step in the values (paper, Table 5)
+        :param terminal_penalty: replaces the reward of a terminating step in the values (paper, Table 5); None keeps it
         :param value_fn: (states (B, obs_dim), actions (B, act_dim)) -> (B,), bootstraps where an episode was cut off;
             without it an episode is taken to go on at its average reward
         :param env: normalises states, as the expert's observations are
@@ -339,7 +339,9 @@ class DelayedReplayBuffer(ReplayBuffer):
         last = np.minimum.accumulate(last[::-1], axis=0)[::-1]  # (T, n_envs): where each episode ends
 
         terminated = (self.dones[rows] * (1 - self.timeouts[rows])) > 0
-        rewards = np.where(terminated, terminal_penalty, self.rewards[rows])
+        rewards = self.rewards[rows]
+        if terminal_penalty is not None:
+            rewards = np.where(terminated, terminal_penalty, rewards)
         if value_fn is None:
             tails = average_reward_tail(rewards, ends, gamma)
         else:

@@ -44,6 +44,8 @@ class SAID(DelayedSAC):
     :param planner_gradient_steps: updates of one planner training; the paper makes 1,000,000
     :param planner_train_freq: also train the planner every so many environment steps; the paper only at the end (None)
     :param planner_newest_fraction: train on the newest part of the buffer only (the paper's 20 % is 0.2)
+    :param planner_terminal_penalty: replaces the reward of a terminating step in the values that weigh windows (paper,
+        Table 5); None keeps it, for tasks that end when they are done
     :param sac_kwargs: every other argument of :class:`~sb3_said.sac.DelayedSAC` and of SB3's ``SAC``
     :raises ValueError: as ``DelayedSAC`` does, for planner settings outside their range, and for a ``state_history``
         in the observations that the planner is not trained to read or that ``VecNormalize`` leaves unscaled
@@ -62,6 +64,7 @@ class SAID(DelayedSAC):
         planner_gradient_steps: int = 20_000,
         planner_train_freq: int | None = None,
         planner_newest_fraction: float = 1.0,
+        planner_terminal_penalty: float | None = -100.0,
         **sac_kwargs: Any,
     ):
         for name, value in (("gradient_steps", planner_gradient_steps), ("train_freq", planner_train_freq)):
@@ -75,6 +78,7 @@ class SAID(DelayedSAC):
         self.planner_gradient_steps = planner_gradient_steps
         self.planner_train_freq = planner_train_freq
         self.planner_newest_fraction = planner_newest_fraction
+        self.planner_terminal_penalty = planner_terminal_penalty
         self._planner_settings: dict[str, Any] = {}  # every field of the config, for files: defaults may change
         self._planner_trained_at = 0  # num_timesteps of the last planner training
         super().__init__(policy, env, learning_rate, **sac_kwargs)
@@ -191,7 +195,11 @@ class SAID(DelayedSAC):
         :raises ValueError: when the buffer is empty, as it is after ``load``
         """
         source = self.replay_buffer.window_source(
-            self.planner_newest_fraction, self.gamma, value_fn=self._stored_values, env=self._vec_normalize_env
+            self.planner_newest_fraction,
+            self.gamma,
+            self.planner_terminal_penalty,
+            value_fn=self._stored_values,
+            env=self._vec_normalize_env,
         )
         return PlannerTrainer(
             self.policy.planner,

@@ -184,6 +184,7 @@ class DepthPlanners:
         return {
             "gradient_steps": self.gradient_steps,
             "newest_fraction": model.planner_newest_fraction,
+            "terminal_penalty": model.planner_terminal_penalty,
             "training_seed": model.seed or 0,
             "trained_steps": model.num_timesteps,
             "config": {key: value for key, value in config.items() if key not in SAMPLING_SETTINGS},

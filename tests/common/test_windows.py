@@ -44,7 +44,7 @@ def naive_starts(rows, n_envs, length, gamma=0.99, terminal_penalty=-100.0, valu
             actions = np.stack([row.next_obs["action_history"][env, -1] for row in steps])
             rewards = [float(row.reward[env]) for row in steps]
             if terminated:
-                rewards[-1] = value = terminal_penalty
+                rewards[-1] = value = rewards[-1] if terminal_penalty is None else terminal_penalty
             elif value_fn is not None:
                 value = float(value_fn(states[-1:], actions[-1:])[0])
             else:
@@ -103,7 +103,7 @@ def test_every_window_is_a_piece_of_one_episode(
     assert len(source.episodes.unique()) == sum(len(naive_episodes(rows[-n_rows:], env)) for env in range(n_envs))
 
 
-@pytest.mark.parametrize(("gamma", "terminal_penalty"), [(0.5, -100.0), (0.99, 0.0), (0.9, 30.0)])
+@pytest.mark.parametrize(("gamma", "terminal_penalty"), [(0.5, -100.0), (0.99, 0.0), (0.9, 30.0), (0.9, None)])
 def test_discount_and_terminal_penalty(gamma, terminal_penalty):
     player = Player(max_length=15)
     rows = player.play(60)

@@ -370,6 +370,7 @@ def test_every_argument_has_a_default_and_is_an_attribute():
         "planner_gradient_steps": 7,
         "planner_train_freq": 9,
         "planner_newest_fraction": 0.2,
+        "planner_terminal_penalty": None,
     }
     assert [p.name for p in own] == list(given) and all(p.default is not p.empty for p in own)
     model = make(**given)
@@ -571,6 +572,18 @@ def test_the_newest_part_of_the_buffer():
     assert trainer.source.rows.min() >= 80
     model.planner_newest_fraction = 1.0
     assert model.make_planner_trainer()._settings["n_windows"] == 100
+
+
+@pytest.mark.parametrize("penalty", [-100.0, None])
+def test_what_an_end_is_worth(penalty):
+    model = make(delayed(truncates=False), planner_terminal_penalty=penalty).learn(60)
+    ends = model.replay_buffer.dones[:60, 0] > 0
+    model.replay_buffer.rewards[:60][ends] = 500.0  # the task is done
+    source = model.make_planner_trainer().source
+    at_ends = ends[source.rows.numpy()]
+    assert 2 < at_ends.sum() < len(source) / 2
+    np.testing.assert_array_equal(source.values[at_ends], 0.0 if penalty == -100.0 else source.values[at_ends].max())
+    assert (source.values[at_ends].mean() > source.values[~at_ends].mean()) == (penalty is None)
 
 
 # ---------------------------------------------------------------------------------------------------- known states
