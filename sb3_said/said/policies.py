@@ -156,7 +156,7 @@ class SAIDPolicy(DelayedSACPolicy):
         """
         planner = self.planner
         entries = [row[key] for key in sorted(row)] if isinstance(row, dict) else [row]
-        seed = zlib.crc32(b"".join(entry.cpu().numpy().tobytes() for entry in entries))
+        seed = zlib.crc32(b"".join((entry.cpu().numpy() + 0.0).tobytes() for entry in entries))  # -0.0 is 0.0
         shape = (planner.config.n_candidates, planner.window_length, planner.obs_dim + planner.act_dim)
         return th.randn(shape, generator=th.Generator().manual_seed(seed))
 

@@ -262,6 +262,15 @@ def test_bad_observations_are_refused_before_planning(trained, key, value, messa
         trained.predict(obs, deterministic=deterministic)
 
 
+def test_a_zeros_sign_changes_no_answer(saved):
+    model = SAID.load(saved, device="cpu")
+    model.set_planner(temperature=1.0)
+    obs = rows_of(observe())[0]  # nothing sent yet: zeros
+    negative = {key: np.where(value == 0, np.float32(-0.0), value) for key, value in obs.items()}
+    assert any(np.signbit(value).any() and not value.any() for value in negative.values())
+    assert np.array_equal(answer(model, negative), answer(model, obs))
+
+
 def test_a_planner_for_one_age_refuses_others(monkeypatch):
     model = make(planner_kwargs={"mask": "fixed"}).learn(60)
     ages, plan = [], model.policy.planner.plan
