@@ -476,9 +476,8 @@ def test_actions_that_take_a_time_each(observation, action, receiver, spare, see
             newest = arrived_as[shown - 1] if shown > 0 else -1  # that shows in the observation
             assert obs["delay"].item() == t - 1 - newest <= process.max_delay
             n_sent = min(t, max_delay)
-            np.testing.assert_allclose(
-                obs["action_history"][max_delay - n_sent :], [env._scale(a) for a in sent[t - n_sent :]]
-            )
+            newest_sent = np.reshape([env._scale(a) for a in sent[t - n_sent :]], (n_sent, 2))
+            np.testing.assert_allclose(obs["action_history"][max_delay - n_sent :], newest_sent)
             assert not obs["action_history"][: max_delay - n_sent].any()
             assert info["forced_deliveries"] == there.forced_deliveries + back.forced_deliveries
             np.testing.assert_array_equal(info["undelayed_observation"], task.states[-1][-1])
