@@ -30,11 +30,12 @@ $(VENV)/.installed: setup.cfg pyproject.toml constraints.txt scripts/install_tor
 
 # A training that has ended says where it saves; the newest folder may be of another.
 # Ctrl-C is for the training, which then saves what was learned: tee -i outlives it.
+# One decision is too small for two threads, which wait for each other wherever another process is busy.
 train: install
 	log=$$(mktemp) && \
 	$(PY) -u scripts/train.py --algo $(ALGO) --env $(ENV) --delay $(DELAY) --preset $(PRESET) -f $(LOGS) | tee -i $$log; \
 	run=$$(sed -n 's/^Saving to //p' $$log); rm -f $$log; test -n "$$run" && \
-	$(PY) scripts/evaluate.py "$$run" --episodes $(EPISODES) --plot "$$run/evaluation.png"
+	$(PY) scripts/evaluate.py "$$run" --episodes $(EPISODES) --num-threads 1 --plot "$$run/evaluation.png"
 
 test: lint type pytest
 

@@ -39,7 +39,7 @@ def test_make_train_evaluates_its_own_run(tmp_path: Path) -> None:
     train, evaluate = (tmp_path / "calls").read_text().splitlines()
     assert "scripts/train.py --algo said" in train
     run = "logs/said/Task_1"
-    assert evaluate == f"scripts/evaluate.py {run} --episodes 3 --plot {run}/evaluation.png"
+    assert evaluate == f"scripts/evaluate.py {run} --episodes 3 --num-threads 1 --plot {run}/evaluation.png"
     assert f"Saving to {run}" in done.stdout  # a long training is watched
 
 
