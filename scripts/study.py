@@ -206,7 +206,9 @@ class Search:
 def open_storage(storage: str) -> BaseStorage:
     """Open an RDB by its URL, or a journal file by its path."""
     if "://" in storage:
-        return RDBStorage(storage)
+        # SQLite lets one worker write at a time, and tells the others that wait longer than this to give up.
+        patience = {"connect_args": {"timeout": 120}} if storage.startswith("sqlite") else {}
+        return RDBStorage(storage, engine_kwargs=patience)
     Path(storage).parent.mkdir(parents=True, exist_ok=True)
     return JournalStorage(JournalFileBackend(storage))
 

@@ -212,10 +212,9 @@ def test_what_yaml_cannot_hold_is_named() -> None:
     assert left_out == ["policy_kwargs"]
 
 
-@pytest.mark.parametrize("storage", [[], ["--storage", "sqlite:///{}/study.db"]], ids=["journal", "sqlite"])
-def test_two_workers_share_a_study_and_train_no_depth_twice(run: Path, storage: list[str]) -> None:
+def test_two_workers_share_a_study_and_train_no_depth_twice(run: Path) -> None:
     grid = ["--depths", "2", "3", "--temperatures", "0", "1"]
-    command = [sys.executable, str(SCRIPT), "--run", str(run), *grid, *QUICK, *(word.format(run) for word in storage)]
+    command = [sys.executable, str(SCRIPT), "--run", str(run), *grid, *QUICK]
     environ = {**os.environ, "OMP_NUM_THREADS": "1"}
     workers = [
         subprocess.Popen(command, env=environ, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
