@@ -227,7 +227,7 @@ def test_two_workers_share_a_study_and_train_no_depth_twice(run: Path) -> None:
     trials = json.loads((run / "tune" / "results.json").read_text())["trials"]
     assert len(trials) == 4 and len({(t["depth"], t["temperature"]) for t in trials}) == 4
     assert not list((run / "tune" / "locks").iterdir())
-    assert (run / "study.db" if storage else run / "tune" / "study.log").exists()
+    assert (run / "tune" / "study.log").exists()
 
 
 def make_planners(run: Path, folder: Path, steps: int) -> DepthPlanners:
