@@ -149,8 +149,8 @@ class Search:
         with self._lock():
             for trial in self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
                 claim = self._claim(trial)
-                if claim.try_acquire():  # its worker died: the cell is free again
-                    self.study.tell(trial.number, state=TrialState.FAIL)
+                if claim.try_acquire():  # its worker died, and the cell is free again; or has ended since the list
+                    self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
                     claim.release()
             taken = [trial for trial in self.study.get_trials(deepcopy=False) if trial.state != TrialState.FAIL]
             waiting = [trial for trial in taken if trial.state == TrialState.WAITING]

@@ -212,9 +212,10 @@ def test_what_yaml_cannot_hold_is_named() -> None:
     assert left_out == ["policy_kwargs"]
 
 
-def test_two_workers_share_a_study_and_train_no_depth_twice(run: Path) -> None:
+@pytest.mark.parametrize("storage", [[], ["--storage", "sqlite:///{}/study.db"]], ids=["journal", "sqlite"])
+def test_two_workers_share_a_study_and_train_no_depth_twice(run: Path, storage: list[str]) -> None:
     grid = ["--depths", "2", "3", "--temperatures", "0", "1"]
-    command = [sys.executable, str(SCRIPT), "--run", str(run), *grid, *QUICK]
+    command = [sys.executable, str(SCRIPT), "--run", str(run), *grid, *QUICK, *(word.format(run) for word in storage)]
     environ = {**os.environ, "OMP_NUM_THREADS": "1"}
     workers = [
         subprocess.Popen(command, env=environ, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
@@ -227,7 +228,7 @@ def test_two_workers_share_a_study_and_train_no_depth_twice(run: Path) -> None:
     trials = json.loads((run / "tune" / "results.json").read_text())["trials"]
     assert len(trials) == 4 and len({(t["depth"], t["temperature"]) for t in trials}) == 4
     assert not list((run / "tune" / "locks").iterdir())
-    assert (run / "tune" / "study.log").exists()
+    assert (run / "study.db" if storage else run / "tune" / "study.log").exists()
 
 
 def make_planners(run: Path, folder: Path, steps: int) -> DepthPlanners:
@@ -422,6 +423,27 @@ def test_the_cell_of_a_dead_worker_is_tried_again(tmp_path: Path) -> None:
     assert sorted(trial.params["temperature"] for trial in other.finished()) == [0.0, 1.0]
     winner = other.winner()
     assert winner is not None and winner.params["temperature"] == 0.0  # of equals, the coldest
+
+
+def test_a_trial_that_ends_while_another_worker_looks_stays_finished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another worker may end its trial and release its claim between the list of running trials and the claim."""
+    search = make_search(tmp_path, [0.0, 1.0], episodes=1)
+    begun = search._begin(FreePlanners())  # type: ignore[arg-type]
+    assert begun is not None
+    listed = search.study.get_trials(states=(TrialState.RUNNING,))
+    search.study.tell(begun[0], 5.0)
+    begun[1].release()
+    get_trials = search.study.get_trials
+
+    def stale(deepcopy: bool = True, states: Any = None) -> Any:
+        return listed if states == (TrialState.RUNNING,) else get_trials(deepcopy, states)
+
+    monkeypatch.setattr(search.study, "get_trials", stale)
+    other = search._begin(FreePlanners())  # type: ignore[arg-type]
+    assert other is not None and other[0].params["temperature"] == 1.0
+    assert [t.state for t in get_trials()] == [TrialState.COMPLETE, TrialState.RUNNING]
 
 
 @pytest.mark.parametrize("storage", ["study.log", "sqlite:///{}/study.db"])
