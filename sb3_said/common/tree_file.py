@@ -28,6 +28,7 @@ FORMAT = 1
 PathOrFile = str | os.PathLike[str] | IO[bytes]
 
 _MEMBERS = {"metadata.json", "tree.json", "tensors.safetensors"}
+ABANDONED_AFTER = 600.0  # seconds since a write's last byte: a living one is never that slow
 _CHUNK = 1 << 24  # bytes read at a time: a large array never exists twice in memory
 # Names the safetensors format has; any other dtype is stored as its bytes, and tree.json tells which it was.
 _SAFETENSORS_NAMES = {
@@ -302,8 +303,8 @@ def _read_metadata(archive: zipfile.ZipFile) -> dict[str, Any]:
 def _replacing(target: PathOrFile) -> Iterator[IO[bytes]]:
     """Write beside the target and swap at the end: a crash leaves the old file, never half a file.
 
-    What a write that was killed left beside the target is removed first; with it, that of another process that is
-    writing the same target now, which then fails.
+    What a write that was killed left beside the target is removed once it is ABANDONED_AFTER old. Several processes may
+    write the same target at a time: the last to finish wins.
     """
     if not isinstance(target, (str, os.PathLike)):
         yield target
@@ -312,12 +313,14 @@ def _replacing(target: PathOrFile) -> Iterator[IO[bytes]]:
     if path.is_dir():
         raise ValueError(f"Cannot write to {path}: it is a folder. Give the path of a file.")
     path.parent.mkdir(parents=True, exist_ok=True)
-    for left in path.parent.glob(glob.escape(f".{path.name}.") + "[0-9a-f]" * 8 + ".tmp"):
-        with contextlib.suppress(OSError):  # where it cannot be removed, it is only in the way
-            left.unlink()
     scratch = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
     try:
         with open(scratch, "xb") as file:
+            now = scratch.stat().st_mtime  # by the file system's clock, as the others' times
+            for left in path.parent.glob(glob.escape(f".{path.name}.") + "[0-9a-f]" * 8 + ".tmp"):
+                with contextlib.suppress(OSError):  # where it cannot be removed, it is only in the way
+                    if now - left.stat().st_mtime > ABANDONED_AFTER:
+                        left.unlink()
             yield file
             file.flush()
             os.fsync(file.fileno())

@@ -11,6 +11,7 @@ import pickletools
 import signal
 import subprocess
 import sys
+import time
 import warnings
 import zipfile
 from collections import OrderedDict, deque
@@ -313,7 +314,22 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_what_a_killed_write_left_is_removed_by_the_next(tmp_path):
+def test_two_processes_may_write_one_file_at_a_time(tmp_path, monkeypatch):
+    path = tmp_path / "tree"
+    write_tensors = tree_file._write_tensors
+
+    def another_writes_meanwhile(file, blobs):
+        monkeypatch.setattr(tree_file, "_write_tensors", write_tensors)
+        save_tree(path, "the other's")
+        assert load_tree(path) == "the other's"
+        write_tensors(file, blobs)
+
+    monkeypatch.setattr(tree_file, "_write_tensors", another_writes_meanwhile)
+    save_tree(path, "the last to finish")
+    assert load_tree(path) == "the last to finish" and list(tmp_path.iterdir()) == [path]
+
+
+def test_what_a_killed_write_left_is_removed_by_a_later_one(tmp_path):
     path = tmp_path / "run[1].zip"
     script = (
         "import os, signal, sys\n"
@@ -327,8 +343,9 @@ def test_what_a_killed_write_left_is_removed_by_the_next(tmp_path):
     (left,) = tmp_path.iterdir()
     assert left.name.startswith(".run[1].zip.") and left.suffix == ".tmp"
     others = {tmp_path / name for name in (".run[1].zip.mine.tmp", ".run1.zip.0123abcd.tmp", ".run[1].zip.0123abcd")}
-    for other in others:
-        other.touch()
+    for stale in (left, *others):
+        stale.touch()
+        os.utime(stale, (0, time.time() - tree_file.ABANDONED_AFTER - 10))
     save_tree(tmp_path / "run[2].zip", 2)
     assert left.exists()  # of another file, which another process may be writing
     save_tree(path, 3)
