@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 # Okabe and Ito's palette: told apart by colour-blind readers too.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+N_DELAYS_PLOTTED = 5  # of the delays whose errors a planner logged, where there are more of them than colours
 
 # One more than colours, so that many agents differ in one or the other.
 MARKERS = "osD^vPX"
@@ -149,8 +150,9 @@ def plot_over_delays(table: Mapping[str, Mapping[int | str, Summary]]) -> list[A
 def plot_planner_errors(run: str | Path, kind: Literal["present", "action"], ax: Axes | None = None) -> Axes:
     """Plot how far the planner is off on held-out windows, beside an MLP regression trained on the same windows.
 
-    One colour for each delay d; solid lines are the planner's ``planner/{kind}_error_d*``, dashed ones the MLP's
-    ``planner/{kind}_error_mlp_d*``. A planner above its dashed line is not trained yet.
+    One colour for each delay d, for five of them where there are many; solid lines are the planner's
+    ``planner/{kind}_error_d*``, dashed ones the MLP's ``planner/{kind}_error_mlp_d*``. A planner above its dashed line
+    is not trained yet.
 
     :param run: folder with SB3's ``progress.csv``, and ``progress_STEPS.csv`` where the training was resumed
     :param kind: "present", the error of the decoded present state in standard deviations of the states; or "action",
@@ -172,12 +174,15 @@ def plot_planner_errors(run: str | Path, kind: Literal["present", "action"], ax:
     ax = panels()[0] if ax is None else ax
     # Over both kinds, so that a delay has the same colour in both plots.
     delays = sorted({int(d) for name in names for d in re.findall(r"planner/\w+_error(?:_mlp)?_d(\d+)", name)})
+    if len(delays) > len(COLORS):  # the shortest, the longest, and some between
+        delays = [delays[round(k)] for k in np.linspace(0, len(delays) - 1, N_DELAYS_PLOTTED)]
+        columns = {name: match for name, match in columns.items() if int(match[2]) in delays}
     updates = _running_total([float(row.get(UPDATES) or 0.0) for row in rows])
     for column, match in sorted(columns.items(), key=lambda item: (int(item[1][2]), item[0])):
         points = [(x, float(row[column])) for x, row in zip(updates, rows, strict=True) if row.get(column)]
         ax.plot(
             *zip(*points, strict=True),
-            color=COLORS[delays.index(int(match[2])) % len(COLORS)],
+            color=COLORS[delays.index(int(match[2]))],
             linestyle="--" if match[1] else "-",
             marker=".",
             label=f"{'MLP' if match[1] else 'planner'}, d = {match[2]}",

@@ -146,7 +146,7 @@ class PlannerTrainer:
         self._n_losses = 0
         self._bad_update = th.full((), -1, device=self.device)
         self._captured = CapturedStep(self._descend, self.generator) if on_gpu else None
-        self._held_out = None if held_source is None else self._draw_held_out(held_source, seed)
+        self._held_out = {} if held_source is None else self._draw_held_out(held_source, seed)
 
     def step(self) -> None:
         """Make one update.
@@ -222,30 +222,26 @@ class PlannerTrainer:
 
     @th.no_grad()
     def evaluate(self) -> dict[str, float]:
-        """Return mean absolute errors on held-out windows, for some delays d from 0 to D.
+        """Return mean absolute errors on held-out windows, for every delay d from 0 to D.
 
         ``planner/present_error_d4`` is the error of the decoded s_t at delay 4, in standard deviations of the states;
         ``planner/action_error_d4`` that of the decision a_t, in environment units; ``..._mlp_d4`` are the
         regression's. The planner decodes with its averaged weights, one candidate and temperature 0.
         """
         self._check_finite()
-        if self._held_out is None:
-            return {}
-        windows, delay = self._held_out
-        batch = self._yardstick_batch(windows, delay)
-        truth, guess = batch[3], self.yardstick(*batch[:3])
-        history = self._action_history(windows.actions, delay)
-        plan = self.planner.plan(windows.states[:, 0], history, delay, temperature=0.0)
         metrics = {}
-        for name, present in (
-            ("", Present(self.planner.normalizer.normalize_states(plan.present), plan.action)),
-            ("_mlp", Present(guess.state, guess.action.clamp(-1.0, 1.0))),
-        ):
-            state_error = (present.state - truth.state).abs().mean(1)  # (B,)
-            action_error = (present.action - truth.action).abs().mean(1)
-            for d in delay.unique().tolist():
-                metrics[f"planner/present_error{name}_d{d}"] = state_error[delay == d].mean().item()
-                metrics[f"planner/action_error{name}_d{d}"] = action_error[delay == d].mean().item()
+        for d, windows in self._held_out.items():
+            delay = th.full((len(windows.states),), d, device=self.device)
+            observed, actions, _, truth, _ = self._yardstick_batch(windows, delay)
+            guess = self.yardstick(observed, actions, delay)
+            history = self._action_history(windows.actions, delay)
+            plan = self.planner.plan(windows.states[:, 0], history, delay, temperature=0.0)
+            for name, present in (
+                ("", Present(self.planner.normalizer.normalize_states(plan.present), plan.action)),
+                ("_mlp", Present(guess.state, guess.action.clamp(-1.0, 1.0))),
+            ):
+                metrics[f"planner/present_error{name}_d{d}"] = (present.state - truth.state).abs().mean().item()
+                metrics[f"planner/action_error{name}_d{d}"] = (present.action - truth.action).abs().mean().item()
         return metrics
 
     def state_dict(self) -> dict[str, Any]:
@@ -332,21 +328,16 @@ class PlannerTrainer:
         history = actions.gather(1, source.clamp_min(0)[..., None].expand(-1, -1, actions.shape[-1]))
         return history * (source >= 0)[..., None]
 
-    def _draw_held_out(self, source: WindowSource, seed: int) -> tuple[Windows, th.Tensor] | None:
-        """Return windows of a few delays, and the delay of each: (B,) int64."""
+    def _draw_held_out(self, source: WindowSource, seed: int) -> dict[int, Windows]:
+        """Return windows of every delay that the planner is trained for; a delay longer than all episodes has none."""
         D, generator = self.planner.max_delay, th.Generator().manual_seed(seed)
-        starts, delays = [], []
-        for d in [D] if self.config.mask == "fixed" else sorted({round(D * k / 4) for k in range(5)}):
+        held_out = {}
+        for d in [D] if self.config.mask == "fixed" else range(D + 1):
             long_enough = th.nonzero(source.remaining > d)[:, 0]  # index d, the decision, is in the same episode
-            drawn = th.randperm(len(long_enough), generator=generator)[:HELD_OUT_WINDOWS]
-            starts.append(long_enough[drawn])
-            delays.append(th.full((len(drawn),), d))
-        if not sum(map(len, starts)):
-            return None
-        return (
-            self._to_device(source.gather(th.cat(starts), self.planner.window_length)),
-            th.cat(delays).to(self.device),
-        )
+            starts = long_enough[th.randperm(len(long_enough), generator=generator)[:HELD_OUT_WINDOWS]]
+            if len(starts):
+                held_out[d] = self._to_device(source.gather(starts, self.planner.window_length))
+        return held_out
 
 
 def _optimizer_state(optimizer: th.optim.Optimizer) -> dict[str, Any]:

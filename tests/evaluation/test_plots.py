@@ -114,6 +114,16 @@ def test_planner_errors(tmp_path: Path, png: Path) -> None:
         plots.plot_planner_errors(tmp_path, "present")
 
 
+def test_errors_of_many_delays_are_thinned(tmp_path: Path) -> None:
+    names = [f"planner/present_error{who}_d{d}" for d in range(17) for who in ("", "_mlp")]
+    (tmp_path / "progress.csv").write_text(
+        ",".join(["planner/n_updates", *names]) + "\n" + ",".join(["100"] + ["0.5"] * 34)
+    )
+    lines = plots.plot_planner_errors(tmp_path, "present").lines
+    assert [line.get_label() for line in lines[::2]] == [f"planner, d = {d}" for d in (0, 4, 8, 12, 16)]
+    assert len({line.get_color() for line in lines}) == 5
+
+
 def test_without_matplotlib_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ImportError, match=r"sb3_said\[plots\]"):

@@ -364,9 +364,9 @@ def test_held_out_episodes_are_never_trained_on():
 
 
 @pytest.mark.parametrize(
-    ("max_delay", "mask", "delays"), [(3, "random", range(4)), (8, "random", (0, 2, 4, 6, 8)), (8, "fixed", [8])]
+    ("max_delay", "mask", "delays"), [(3, "random", range(4)), (8, "random", range(9)), (8, "fixed", [8])]
 )
-def test_evaluation_covers_the_delays(max_delay, mask, delays):
+def test_evaluation_covers_every_delay(max_delay, mask, delays):
     metrics = make_trainer(max_delay=max_delay, mask=mask).evaluate()
     expected = {
         f"planner/{what}_error{who}_d{d}" for what in ("present", "action") for who in ("", "_mlp") for d in delays
@@ -379,9 +379,10 @@ def test_evaluation_covers_the_delays(max_delay, mask, delays):
 
 def test_evaluation_s_windows_reach_the_decision():
     trainer = make_trainer(source=make_source(40, 5), max_delay=3)
-    windows, delay = trainer._held_out
-    assert set(delay.tolist()) == {0, 1, 2, 3}
-    assert windows.valid[th.arange(len(delay)), delay].all()
+    assert list(trainer._held_out) == [0, 1, 2, 3]
+    assert all(windows.valid[:, d].all() for d, windows in trainer._held_out.items())
+    # Episodes of five steps hold no decision that is six steps old.
+    assert list(make_trainer(source=make_source(40, 5), max_delay=6)._held_out) == [0, 1, 2, 3, 4]
 
 
 def test_global_generator_is_neither_read_nor_moved():
@@ -419,15 +420,15 @@ def test_callback_can_stop():
 def test_evaluation_sees_no_future_action():
     """Errors are those of an agent: whatever is unknown at the decision may be anything."""
     trainer = make_trainer()
-    windows, delay = trainer._held_out
-    before = trainer._action_history(windows.actions, delay)
-    for history, actions, d in zip(before, windows.actions, delay.tolist(), strict=True):
-        np.testing.assert_array_equal(history[D - d :], actions[:d])
-        np.testing.assert_array_equal(history[: D - d], 0.0)
-    guess = trainer.yardstick(windows.states[:, 0], windows.actions, delay)
-    unknown = th.arange(windows.actions.shape[1]) >= delay[:, None]
-    others = windows.actions.masked_fill(unknown[..., None], 7.0)
-    assert_same(dict(guess._asdict()), dict(trainer.yardstick(windows.states[:, 0], others, delay)._asdict()))
+    for d, windows in trainer._held_out.items():
+        delay = th.full((len(windows.states),), d)
+        history = trainer._action_history(windows.actions, delay)
+        np.testing.assert_array_equal(history[:, D - d :], windows.actions[:, :d])
+        np.testing.assert_array_equal(history[:, : D - d], 0.0)
+        guess = trainer.yardstick(windows.states[:, 0], windows.actions, delay)
+        others = windows.actions.clone()
+        others[:, d:] = 7.0
+        assert_same(dict(guess._asdict()), dict(trainer.yardstick(windows.states[:, 0], others, delay)._asdict()))
 
 
 def test_no_held_out_data():
