@@ -29,6 +29,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_said import DelayedSAC
+from sb3_said.common.files import write_text
 from sb3_said.evaluation import bootstrap_interval, rollout
 from sb3_said.evaluation.plots import COLORS, panels, save
 
@@ -84,8 +85,7 @@ def train(args: argparse.Namespace) -> None:
         "curve": evaluation.curve,
     }
     path = args.results / f"{args.env}_{args.trainer}_seed{args.seed}.json"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(result) + "\n")
+    write_text(path, json.dumps(result) + "\n")
     print(f"wrote {path.name}")
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch as th
 
+from sb3_said.common.files import write_text
 from sb3_said.common.precision import compute_dtype
 from sb3_said.evaluation import Interval, bootstrap_interval
 
@@ -123,8 +124,7 @@ def write_json(path: Path | None, args: argparse.Namespace, rows: Sequence[Mappi
         return
     settings = {key: value for key, value in vars(args).items() if key != "json"}
     result = {"date": date.today().isoformat(), "settings": settings, "machine": machine(args.device)}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({**result, "rows": list(rows), **more}, indent=1, default=_plain) + "\n")
+    write_text(path, json.dumps({**result, "rows": list(rows), **more}, indent=1, default=_plain) + "\n")
 
 
 def machine(device: str | th.device = "cpu") -> dict[str, Any]:

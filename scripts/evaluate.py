@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,8 +10,9 @@ from typing import Any
 import torch as th
 from runs import LoadedRun, answering, answers, load_run, origin
 from tqdm import tqdm
-from zoo import add_delay, read_delay, write_text
+from zoo import add_delay, read_delay
 
+from sb3_said.common.files import write_json
 from sb3_said.evaluation import Summary, collect_observations, measure_latency, plots, rollout
 
 EPILOG = """\
@@ -81,7 +81,6 @@ def main(argv: list[str] | None = None) -> None:
     print_table(summaries)
 
     target = args.json or run.folder / "evaluation.json"
-    target.parent.mkdir(parents=True, exist_ok=True)
     settings = {
         "n_episodes": args.episodes, "seed": args.seed, "n_envs": args.n_envs, "deterministic": not args.stochastic
     }  # fmt: skip
@@ -91,7 +90,7 @@ def main(argv: list[str] | None = None) -> None:
         "results": [summary.to_dict() for summary in summaries],
         "origin": origin(run),
     }
-    write_text(target, json.dumps(document, indent=2, allow_nan=False) + "\n")
+    write_json(target, document)
     print(f"Wrote {target}")
     if args.plot is not None:
         draw(args.plot, summaries, run.folder)

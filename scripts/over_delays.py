@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 import torch as th
 from runs import LoadedRun, answering, answers, load_run, longest_delay, origin
-from zoo import Delay, largest_delay, read_delay, write_text
+from zoo import Delay, largest_delay, read_delay
 
+from sb3_said.common.files import write_json
 from sb3_said.delays import FixedDelay
 from sb3_said.delays.processes import make_process
 from sb3_said.evaluation import Summary, bootstrap_interval, plots, rollout
@@ -235,8 +236,7 @@ class Results:
         """Write the file, whole or not at all."""
         cells = [{**asdict(cell), **self.found[cell]} for cell in self.cells if cell in self.found]
         document = {**self.settings, "origins": self.origins, "cells": cells + self.others}
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        write_text(self.path, json.dumps(document, indent=2, allow_nan=False) + "\n")
+        write_json(self.path, document)
 
     def table(self) -> dict[str, dict[int | str, Summary]]:
         """Return for each agent what it did under each delay that it could play."""

@@ -17,10 +17,10 @@ from optuna.trial import FrozenTrial
 from runs import LoadedRun, load_run, origin
 from study import Search, returns_of, save_plots
 from winner import RunConfig
-from zoo import write_text
 
 from sb3_said import SAID
 from sb3_said.common.checkpoint import CHECKPOINT_NAME
+from sb3_said.common.files import write_json
 from sb3_said.evaluation import bootstrap_interval, rollout
 from sb3_said.said.tuning import Claim, DepthPlanners
 
@@ -256,7 +256,7 @@ def report(
         "report": {**fresh, "deterministic": True, "results": played},
         "origin": origin(run),
     }
-    write_text(results, json.dumps(document, indent=2, allow_nan=False) + "\n")
+    write_json(results, document)
 
     pruned = sum(trial["state"] == "PRUNED" for trial in trials)
     print(f"\n{len(trials)} trials, {pruned} of them pruned. Best: depth {winner.params['depth']}, "

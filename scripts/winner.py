@@ -10,7 +10,9 @@ from typing import Any
 
 import yaml
 from rl_zoo3.utils import get_saved_hyperparams
-from zoo import PRESETS, WRAPPER, write_text
+from zoo import PRESETS, WRAPPER
+
+from sb3_said.common.files import write_text
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC, PlannerTrainingCallback
 from sb3_said.common.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback, restore_training
+from sb3_said.common.files import write_json
 from sb3_said.delays.combined import fixed_delay
 from sb3_said.delays.processes import make_process
 
@@ -284,16 +285,9 @@ def drop_undone_episodes(run_dir: Path, steps: int) -> None:
         os.truncate(file, size)  # in place: the environments have opened it, to append to it
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a file whole or not at all."""
-    unfinished = path.with_name(f"{path.name}.{os.getpid()}")
-    unfinished.write_text(text)
-    unfinished.replace(path)
-
-
 def write_arguments(run_dir: Path, argv: list[str]) -> None:
     """Keep the command line of a run for ``read_arguments``."""
-    write_text(run_dir / ARGUMENTS_NAME, json.dumps(argv))
+    write_json(run_dir / ARGUMENTS_NAME, argv)
 
 
 def read_arguments(run_dir: Path) -> list[str]:

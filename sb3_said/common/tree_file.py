@@ -8,14 +8,12 @@ Reading one builds only plain values, arrays and tensors, so a file from a stran
 from __future__ import annotations
 
 import contextlib
-import glob
 import importlib.metadata
 import json
 import math
 import os
 import pathlib
 import platform
-import uuid
 import zipfile
 from collections import OrderedDict
 from collections.abc import Iterator
@@ -24,11 +22,11 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 import torch as th
 
+from sb3_said.common.files import PathOrFile, replacing
+
 FORMAT = 1
-PathOrFile = str | os.PathLike[str] | IO[bytes]
 
 _MEMBERS = {"metadata.json", "tree.json", "tensors.safetensors"}
-ABANDONED_AFTER = 600.0  # seconds since a write's last byte: a living one is never that slow
 _CHUNK = 1 << 24  # bytes read at a time: a large array never exists twice in memory
 # Names the safetensors format has; any other dtype is stored as its bytes, and tree.json tells which it was.
 _SAFETENSORS_NAMES = {
@@ -224,7 +222,7 @@ def write_file(
     except (TypeError, ValueError) as error:
         raise ValueError(f"metadata must be JSON: dict, list, str, finite numbers, bool or None. {error}.") from error
     root_json = json.dumps(root, allow_nan=False)
-    with _replacing(target) as file, zipfile.ZipFile(file, "w") as archive:
+    with replacing(target) as file, zipfile.ZipFile(file, "w") as archive:
         # ZipInfo without a date: equal content gives equal bytes.
         archive.writestr(zipfile.ZipInfo("metadata.json"), description_json)
         archive.writestr(zipfile.ZipInfo("tree.json"), root_json)
@@ -297,37 +295,6 @@ def _read_metadata(archive: zipfile.ZipFile) -> dict[str, Any]:
             f" (the file was written with {metadata.get('versions')})"
         )
     return metadata
-
-
-@contextlib.contextmanager
-def _replacing(target: PathOrFile) -> Iterator[IO[bytes]]:
-    """Write beside the target and swap at the end: a crash leaves the old file, never half a file.
-
-    What a write that was killed left beside the target is removed once it is ABANDONED_AFTER old. Several processes may
-    write the same target at a time: the last to finish wins.
-    """
-    if not isinstance(target, (str, os.PathLike)):
-        yield target
-        return
-    path = pathlib.Path(os.path.realpath(target))  # a symbolic link stays, and what it points to is replaced
-    if path.is_dir():
-        raise ValueError(f"Cannot write to {path}: it is a folder. Give the path of a file.")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
-    try:
-        with open(scratch, "xb") as file:
-            now = scratch.stat().st_mtime  # by the file system's clock, as the others' times
-            for left in path.parent.glob(glob.escape(f".{path.name}.") + "[0-9a-f]" * 8 + ".tmp"):
-                with contextlib.suppress(OSError):  # where it cannot be removed, it is only in the way
-                    if now - left.stat().st_mtime > ABANDONED_AFTER:
-                        left.unlink()
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(scratch, path)
-    except BaseException:
-        scratch.unlink(missing_ok=True)
-        raise
 
 
 def _write_tensors(file: IO[bytes], blobs: dict[str, th.Tensor | np.ndarray]) -> None:

@@ -8,10 +8,6 @@ import os
 import pathlib
 import pickle
 import pickletools
-import signal
-import subprocess
-import sys
-import time
 import warnings
 import zipfile
 from collections import OrderedDict, deque
@@ -297,68 +293,6 @@ def test_an_optimizer_goes_on_as_if_never_saved(optimizer_class, tmp_path):
         step(resumed_network, resumed_optimizer)
     assert same(dict(network.state_dict()), dict(resumed_network.state_dict()))
     assert same(optimizer.state_dict(), resumed_optimizer.state_dict())
-
-
-def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
-    path = tmp_path / "tree"
-    save_tree(path, {"a": th.ones(3)})
-    before = path.read_bytes()
-
-    def disk_full(blob):
-        raise OSError("disk full")
-
-    monkeypatch.setattr(tree_file, "_bytes_of", disk_full)
-    with pytest.raises(OSError, match="disk full"):
-        save_tree(path, {"a": th.zeros(3)})
-    assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_two_processes_may_write_one_file_at_a_time(tmp_path, monkeypatch):
-    path = tmp_path / "tree"
-    write_tensors = tree_file._write_tensors
-
-    def another_writes_meanwhile(file, blobs):
-        monkeypatch.setattr(tree_file, "_write_tensors", write_tensors)
-        save_tree(path, "the other's")
-        assert load_tree(path) == "the other's"
-        write_tensors(file, blobs)
-
-    monkeypatch.setattr(tree_file, "_write_tensors", another_writes_meanwhile)
-    save_tree(path, "the last to finish")
-    assert load_tree(path) == "the last to finish" and list(tmp_path.iterdir()) == [path]
-
-
-def test_what_a_killed_write_left_is_removed_by_a_later_one(tmp_path):
-    path = tmp_path / "run[1].zip"
-    script = (
-        "import os, signal, sys\n"
-        "from sb3_said.common import tree_file\n"
-        "tree_file._write_tensors = lambda *_: os.kill(os.getpid(), signal.SIGKILL)\n"
-        "tree_file.save_tree(sys.argv[1], 1)\n"
-    )
-    root = pathlib.Path(tree_file.__file__).parents[2]  # importable from there, installed or not
-    killed = subprocess.run([sys.executable, "-c", script, str(path)], cwd=root, check=False)
-    assert killed.returncode == -signal.SIGKILL
-    (left,) = tmp_path.iterdir()
-    assert left.name.startswith(".run[1].zip.") and left.suffix == ".tmp"
-    others = {tmp_path / name for name in (".run[1].zip.mine.tmp", ".run1.zip.0123abcd.tmp", ".run[1].zip.0123abcd")}
-    for stale in (left, *others):
-        stale.touch()
-        os.utime(stale, (0, time.time() - tree_file.ABANDONED_AFTER - 10))
-    save_tree(tmp_path / "run[2].zip", 2)
-    assert left.exists()  # of another file, which another process may be writing
-    save_tree(path, 3)
-    assert set(tmp_path.iterdir()) == others | {path, tmp_path / "run[2].zip"} and load_tree(path) == 3
-
-
-def test_a_symbolic_link_keeps_pointing(tmp_path):
-    save_tree(tmp_path / "real", 1)
-    (tmp_path / "link").symlink_to("real")
-    save_tree(tmp_path / "link", 2)
-    assert (tmp_path / "link").is_symlink() and load_tree(tmp_path / "real") == 2
-    with pytest.raises(ValueError, match="folder"):
-        save_tree(tmp_path, 1)
 
 
 # --- files that are not what they should be ---

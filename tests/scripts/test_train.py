@@ -376,13 +376,12 @@ def test_settings_given_twice_are_joined(given: str, read: str) -> None:
 
 def test_the_command_line_is_kept_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     zoo.write_arguments(tmp_path, ["-n", "5"])
-    write = Path.write_text
 
-    def killed(path: Path, text: str) -> None:
-        write(path, text[:3])
+    def killed(descriptor: int) -> None:
+        os.truncate(descriptor, 3)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Path, "write_text", killed)
+    monkeypatch.setattr(os, "fsync", killed)
     with pytest.raises(KeyboardInterrupt):
         zoo.write_arguments(tmp_path, ["-n", "70"])
     assert zoo.read_arguments(tmp_path) == ["-n", "5"]

@@ -1,0 +1,65 @@
+"""Files that are there whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import json
+import os
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any
+
+PathOrFile = str | os.PathLike[str] | IO[bytes]
+
+ABANDONED_AFTER = 600.0  # seconds since a write's last byte: a living one is never that slow
+
+
+@contextlib.contextmanager
+def replacing(target: PathOrFile) -> Iterator[IO[bytes]]:
+    """Write beside the target and swap at the end: a crash leaves the old file, never half a file.
+
+    What a write that was killed left beside the target is removed once it is ABANDONED_AFTER old. Several processes may
+    write the same target at a time: the last to finish wins.
+
+    :param target: where to write; missing folders are made. Or a binary file object, which is given back as it is.
+    :return: the binary file to write to
+    :raises ValueError: if the target is a folder
+    """
+    if not isinstance(target, (str, os.PathLike)):
+        yield target
+        return
+    path = Path(os.path.realpath(target))  # a symbolic link stays, and what it points to is replaced
+    if path.is_dir():
+        raise ValueError(f"Cannot write to {path}: it is a folder. Give the path of a file.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    scratch = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
+    try:
+        with open(scratch, "xb") as file:
+            now = scratch.stat().st_mtime  # by the file system's clock, as the others' times
+            for left in path.parent.glob(glob.escape(f".{path.name}.") + "[0-9a-f]" * 8 + ".tmp"):
+                with contextlib.suppress(OSError):  # where it cannot be removed, it is only in the way
+                    if now - left.stat().st_mtime > ABANDONED_AFTER:
+                        left.unlink()
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(scratch, path)
+    except BaseException:
+        scratch.unlink(missing_ok=True)
+        raise
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text in UTF-8, as :func:`replacing` writes."""
+    with replacing(path) as file:
+        file.write(text.encode("utf-8"))
+
+
+def write_json(path: Path, document: Any) -> None:
+    """Write a JSON document, indented for its readers, as :func:`replacing` writes.
+
+    :raises ValueError: if it holds NaN or an infinite number, which JSON lacks
+    """
+    write_text(path, json.dumps(document, indent=2, allow_nan=False) + "\n")
