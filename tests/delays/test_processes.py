@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from logged_task import LoggedTask
 from random_processes import N, draw_packets, frequencies, processes
 
 from sb3_said.delays import (
     WIFI_20MS,
+    DelayedObservationWrapper,
     DistributionDelay,
     EpisodeDelay,
     FixedDelay,
@@ -143,6 +145,34 @@ def test_a_process_that_breaks_its_promise_amid_an_episode_is_refused_then():
         assert [next(delays), next(delays)] == [3, None]
         with pytest.raises(ValueError, match=reason):
             next(delays)
+
+
+class TableDelay:
+    """A user's own process."""
+
+    def __init__(self, max_delay, draws):
+        self.max_delay = max_delay
+        self.draws = iter(draws)
+
+    def sample(self, rng):
+        return next(self.draws)
+
+
+def test_a_users_own_process():
+    env = DelayedObservationWrapper(LoggedTask(), TableDelay(3, [3, 0, 2]))
+    assert env.max_delay == 3
+    for delay in [3, 0, 2]:
+        env.reset()
+        ages = [env.step(env.action_space.sample())[0]["delay"].item() for _ in range(6)]
+        assert ages == [min(t, delay) for t in range(1, 7)]
+
+
+@pytest.mark.parametrize("draw", [-1, 4])
+def test_a_process_outside_its_range_is_refused(draw):
+    # A negative delay would hand out the oldest state as the newest.
+    env = DelayedObservationWrapper(LoggedTask(), TableDelay(3, [draw]))
+    with pytest.raises(ValueError, match=f"drew a delay of {draw}"):
+        env.reset()
 
 
 # ---------------------------------------------------------------------------------------------------- statistics

@@ -1,7 +1,6 @@
 """The delayed world: exact ages, histories and true states at every step of whole episodes."""
 
 import copy
-from collections import deque
 from functools import partial
 
 import gymnasium as gym
@@ -11,6 +10,7 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env as check_gymnasium_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from logged_task import HIGH, LOW, LoggedTask, delay_of_episode
 from random_processes import processes
 from stable_baselines3.common.env_checker import check_env as check_sb3_env
 from stable_baselines3.common.env_util import make_vec_env
@@ -23,56 +23,9 @@ from sb3_said.delays import (
     DroppedPackets,
     EpisodeDelay,
     FixedDelay,
-    HeldDelay,
-    TotalDelay,
     UniformDelay,
 )
 from sb3_said.delays.receivers import RECEIVERS, IndependentDraw
-
-LOW, HIGH = np.array([-2.0, 0.0], np.float32), np.array([2.0, 8.0], np.float32)
-
-
-class LoggedTask(gym.Env):
-    """Random states and lop-sided action bounds; logs what it was really in and given, an episode a list."""
-
-    def __init__(self, length=12, low=LOW, high=HIGH, dtype=np.float64):
-        self.observation_space = spaces.Box(-np.inf, np.inf, (3,), dtype)
-        self.action_space = spaces.Box(low, high, dtype=np.float32)
-        self.length = length
-        self.states, self.actions = [], []
-        self.buffer = np.zeros(3, dtype)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.states.append([])
-        self.actions.append([])
-        return self._state(), {"options": options}
-
-    def step(self, action):
-        self.actions[-1].append(np.array(action))
-        ended = len(self.actions[-1]) == self.length
-        return self._state(), float(action[0]), ended, False, {"t": len(self.actions[-1])}
-
-    def _state(self):
-        self.buffer[:] = self.np_random.normal(size=3)  # in place, as some simulators do
-        self.states[-1].append(self.buffer.astype(np.float32))  # a copy
-        return self.buffer
-
-
-class TableDelay:
-    """A user's own process."""
-
-    def __init__(self, max_delay, draws):
-        self.max_delay = max_delay
-        self.draws = iter(draws)
-
-    def sample(self, rng):
-        return next(self.draws)
-
-
-def delay_of_episode(receiver):
-    """Of a process that draws one delay for all packets of an episode."""
-    return next(receiver._delays)
 
 
 def assert_observation(obs, task, delay, max_delay):
@@ -383,156 +336,9 @@ def test_max_delay_below_the_delay_is_refused():
             DelayedObservationWrapper(LoggedTask(), 0, max_delay=bad)
 
 
-# ---------------------------------------------------------------------------------------------------- action delay
-
-
-class Robot:
-    """A task as it is: actions queue up on their way to it, observations on their way back."""
-
-    def __init__(self, name, n_there, n_back, seed):
-        self.env = gym.make(name)
-        self.state = self.env.reset(seed=seed)[0]
-        self.there = deque([None] * n_there)
-        self.back = deque([self.state] * n_back)
-
-    def step(self, action):
-        """One control step: the newest action sets off, the oldest on its way is executed."""
-        self.there.append(action)
-        executed = self.there.popleft()
-        if executed is not None:  # the task starts when the first action arrives
-            self.state = self.env.step(executed)[0]
-        self.back.append(self.state)
-        return self.back.popleft()
-
-
-@pytest.mark.parametrize(("d", "k"), [(0, 3), (3, 0), (2, 4), (4, 2)])
-def test_d_observation_steps_and_k_action_steps_are_d_plus_k_observation_steps(d, k):
-    def policy(observation, t):  # in closed loop, so that a difference would grow
-        return np.clip(np.sin(5 * observation[-3:] + t), -1, 1).astype(np.float32)
-
-    robot = Robot("Hopper-v5", k, d, seed=1)
-    wrappers = [
-        DelayedObservationWrapper(gym.make("Hopper-v5"), d, k),
-        DelayedObservationWrapper(gym.make("Hopper-v5"), d + k),
-        DelayedObservationWrapper(gym.make("Hopper-v5"), FixedDelay(d), (k, k)),
-    ]
-    observations = [env.reset(seed=1)[0] for env in wrappers]
-    observation = np.asarray(robot.state, np.float32)
-    for t in range(15):
-        for obs in observations:
-            np.testing.assert_array_equal(obs["observation"], observation)
-            np.testing.assert_array_equal(obs["action_history"], observations[0]["action_history"])
-            assert obs["delay"].item() == min(t, d + k) and obs["action_history"].shape == (d + k, 3)
-        action = policy(observation, t)
-        observation = np.asarray(robot.step(action), np.float32)
-        observations = [env.step(action)[0] for env in wrappers]
-
-
-def test_action_delays_are_drawn_anew_each_episode():
-    env = DelayedObservationWrapper(LoggedTask(), 2, (0, 5))
-    env.reset(seed=0)
-    drawn = []
-    for _ in range(60):
-        env.reset()
-        drawn.append(delay_of_episode(env.receiver))
-    assert set(drawn) == set(range(2, 8)) and env.max_delay == 7
-
-
-@settings(deadline=None)
-@given(
-    processes(),
-    processes().filter(lambda p: TotalDelay(0, p).action_varies),
-    st.sampled_from(sorted(RECEIVERS)),
-    st.integers(0, 2),
-    st.integers(0, 2**16),
-)
-def test_actions_that_take_a_time_each(observation, action, receiver, spare, seed):
-    task = LoggedTask(length=25)
-    process = TotalDelay(observation, action)
-    max_delay = process.max_delay + spare
-    env = DelayedObservationWrapper(
-        task, observation, action, max_delay=max_delay, receiver=receiver, state_history=True
-    )
-    twin = DelayedObservationWrapper(LoggedTask(length=25), process, max_delay=max_delay, receiver=receiver)
-    there, back = RECEIVERS[receiver](action), RECEIVERS[receiver](observation)  # themselves tested against arrivals
-    env.action_space.seed(seed)
-    for episode in range(2):
-        obs, info = env.reset(seed=seed + episode)
-        twin.reset(seed=seed + episode)
-        rng = np.random.default_rng([seed + episode, 1])
-        there.reset(rng.spawn(1)[0])
-        back.reset(rng)
-        sent, arrived_as, handed_out = [], [], {0}  # arrived_as: which of those sent each step executed
-        for t in range(1, task.length + 1):
-            sent.append(env.action_space.sample())
-            arrived_as.append(t - 1 - (there.step() if t > 1 else 0))
-            obs, *_, info = env.step(sent[-1])
-            for key, value in twin.step(sent[-1])[0].items():
-                np.testing.assert_array_equal(value, obs[key])  # one process says the same as two
-            np.testing.assert_array_equal(task.actions[-1][-1], sent[arrived_as[-1]])
-            np.testing.assert_allclose(env._scale(task.actions[-1][-1]), info["executed_action"])
-            shown = t - back.step()
-            np.testing.assert_array_equal(obs["observation"], task.states[-1][shown])
-            newest = arrived_as[shown - 1] if shown > 0 else -1  # that shows in the observation
-            assert obs["delay"].item() == t - 1 - newest <= process.max_delay
-            n_sent = min(t, max_delay)
-            newest_sent = np.reshape([env._scale(a) for a in sent[t - n_sent :]], (n_sent, 2))
-            np.testing.assert_allclose(obs["action_history"][max_delay - n_sent :], newest_sent)
-            assert not obs["action_history"][: max_delay - n_sent].any()
-            assert info["forced_deliveries"] == there.forced_deliveries + back.forced_deliveries
-            np.testing.assert_array_equal(info["undelayed_observation"], task.states[-1][-1])
-            handed_out.add(shown)
-            # the row of the first action that does not show in it is the one after the observation's
-            offset = shown + int(obs["delay"].item()) - max_delay + 1
-            known = np.array([offset + row in handed_out for row in range(max_delay)], np.float32)
-            np.testing.assert_array_equal(obs["state_known"], known)
-            for row in np.flatnonzero(known):
-                np.testing.assert_array_equal(obs["state_history"][row], task.states[-1][offset + row])
-            assert not obs["state_history"][known == 0].any()
-            assert env.observation_space.contains(obs)
-
-
-def test_equal_delays_of_every_action_become_one_delay():
-    robot = LoggedTask(length=40)
-    env = DelayedObservationWrapper(robot, 2, UniformDelay(3, 3))
-    env.action_space.seed(0)
-    env.reset(seed=0)
-    sent = [env.action_space.sample() for _ in range(30)]
-    delays = [env.step(action)[0]["delay"].item() for action in sent]
-    # a_0 is there from the start and is held until a_1 arrives, so that s_3 at t = 5 still shows no other
-    assert delays == [1, 2, 2, 3, 4, *[5] * 25]
-    np.testing.assert_array_equal(robot.actions[-1], [sent[max(t - 3, 0)] for t in range(30)])
-
-
-def test_one_delay_for_each_action_is_refused_inside_another_process():
-    env = DelayedObservationWrapper(LoggedTask(), HeldDelay(TotalDelay(2, WIFI_20MS)))
-    env.reset()
-    with pytest.raises(ValueError, match=r"draws a delay for every action, .* not inside another process"):
-        env.step(env.action_space.sample())
-    with pytest.raises(ValueError, match="delay"):
-        DelayedObservationWrapper(LoggedTask(), 2, -1)
-
-
 def test_an_unknown_receiver_is_refused():
     with pytest.raises(ValueError, match=r"receiver is 'oldest', expected one of \('newest', 'independent'\)"):
         DelayedObservationWrapper(LoggedTask(), 2, receiver="oldest")
-
-
-def test_a_users_own_process():
-    env = DelayedObservationWrapper(LoggedTask(), TableDelay(3, [3, 0, 2]))
-    assert env.max_delay == 3
-    for delay in [3, 0, 2]:
-        env.reset()
-        ages = [env.step(env.action_space.sample())[0]["delay"].item() for _ in range(6)]
-        assert ages == [min(t, delay) for t in range(1, 7)]
-
-
-@pytest.mark.parametrize("draw", [-1, 4])
-def test_a_process_outside_its_range_is_refused(draw):
-    # A negative delay would hand out the oldest state as the newest.
-    env = DelayedObservationWrapper(LoggedTask(), TableDelay(3, [draw]))
-    with pytest.raises(ValueError, match=f"drew a delay of {draw}"):
-        env.reset()
 
 
 def test_fixed_process_equals_integer():
