@@ -23,16 +23,21 @@ def replacing(target: PathOrFile) -> Iterator[IO[bytes]]:
     What a write that was killed left beside the target is removed once it is ABANDONED_AFTER old. Several processes may
     write the same target at a time: the last to finish wins.
 
-    :param target: where to write; missing folders are made. Or a binary file object, which is given back as it is.
+    :param target: where to write; missing folders are made. A device or a pipe, such as /dev/stdout, is written to and
+        stays. Or a binary file object, which is given back as it is.
     :return: the binary file to write to
     :raises ValueError: if the target is a folder
     """
     if not isinstance(target, (str, os.PathLike)):
         yield target
         return
+    if os.path.isdir(target):
+        raise ValueError(f"Cannot write to {os.fspath(target)}: it is a folder. Give the path of a file.")
+    if os.path.exists(target) and not os.path.isfile(target):
+        with open(target, "wb") as file:
+            yield file
+        return
     path = Path(os.path.realpath(target))  # a symbolic link stays, and what it points to is replaced
-    if path.is_dir():
-        raise ValueError(f"Cannot write to {path}: it is a folder. Give the path of a file.")
     path.parent.mkdir(parents=True, exist_ok=True)
     scratch = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
     try:

@@ -34,6 +34,15 @@ def test_a_file_object_is_written_as_it_is():
     assert file is target and target.getvalue() == b"text"
 
 
+def test_a_pipe_is_written_to_and_stays(tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with os.fdopen(os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)) as reader:
+        write_text(pipe, "text")
+        assert reader.read() == "text"
+    assert pipe.is_fifo() and list(tmp_path.iterdir()) == [pipe]
+
+
 def test_a_failed_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "text"
     write_text(path, "old")
