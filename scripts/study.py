@@ -275,10 +275,15 @@ def save_plots(search: Search, folder: Path) -> list[Path]:
         }
         value = float(np.mean(returns_of(trial)))
         whole.add_trial(optuna.trial.create_trial(value=value, params=trial.params, distributions=distributions))
-    grid = {name: levels[name] if name == "depth" else search.temperatures for name in varied}
+    # Of any temperature there are as many levels as were named; a grid's are those of all its workers.
+    bins = {**levels, "temperature": search.temperatures} if search.sampler == "tpe" else levels
+    effects = MainEffects({name: bins[name] for name in varied})
     paths = [folder / "importance.png", folder / "slice.png"]
     for path, drawing in (
-        (paths[0], lambda: draw.plot_param_importances(whole, MainEffects(grid), varied, target_name="mean return")),
+        (
+            paths[0],
+            lambda: draw.plot_param_importances(whole, effects, varied, target_name="mean return"),
+        ),
         (paths[1], lambda: draw.plot_slice(whole, varied, target_name="mean return")),
     ):
         with warnings.catch_warnings():

@@ -23,6 +23,7 @@ pytest.importorskip("rl_zoo3")
 pytest.importorskip("scipy")
 
 import optuna
+import study
 import train
 import tune
 import yaml
@@ -459,7 +460,7 @@ def test_tpe_tries_as_many_as_it_is_told(tmp_path: Path, storage: str) -> None:
 
 
 def test_importance_is_the_explained_variance() -> None:
-    study = optuna.create_study(direction="maximize")
+    tried = optuna.create_study(direction="maximize")
     distributions = {
         "depth": optuna.distributions.IntDistribution(2, 8),
         "temperature": optuna.distributions.FloatDistribution(0.0, 1.0),
@@ -468,10 +469,23 @@ def test_importance_is_the_explained_variance() -> None:
         for temperature in (0.0, 0.52, 1.0):
             params = {"depth": depth, "temperature": temperature}
             value = 10.0 * depth
-            study.add_trial(optuna.trial.create_trial(value=value, params=params, distributions=distributions))
+            tried.add_trial(optuna.trial.create_trial(value=value, params=params, distributions=distributions))
     evaluator = MainEffects({"depth": [2, 4, 8], "temperature": [0.0, 0.5, 1.0]})
-    found = optuna.importance.get_param_importances(study, evaluator=evaluator)
+    found = optuna.importance.get_param_importances(tried, evaluator=evaluator)
     assert found == pytest.approx({"depth": 1.0, "temperature": 0.0})
+
+
+def test_importance_counts_the_cells_of_workers_with_other_grids(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("matplotlib")
+    for temperatures in ([0.0, 0.5, 1.0], [0.0, 0.3]):
+        search = make_search(tmp_path, temperatures, episodes=1, prune=0.0)
+        search.work(FreePlanners(), lambda seed, n: [float(seed)] * n)  # type: ignore[arg-type]
+    levels: list[dict[str, Any]] = []
+    monkeypatch.setattr(study, "MainEffects", lambda given: levels.append(given) or MainEffects(given))
+    assert len(study.save_plots(search, tmp_path)) == 2
+    assert levels == [{"temperature": [0.0, 0.3, 0.5, 1.0]}]
 
 
 @pytest.mark.parametrize(
