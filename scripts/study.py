@@ -280,10 +280,7 @@ def save_plots(search: Search, folder: Path) -> list[Path]:
     effects = MainEffects({name: bins[name] for name in varied})
     paths = [folder / "importance.png", folder / "slice.png"]
     for path, drawing in (
-        (
-            paths[0],
-            lambda: draw.plot_param_importances(whole, effects, varied, target_name="mean return"),
-        ),
+        (paths[0], lambda: draw.plot_param_importances(whole, effects, varied, target_name="mean return")),
         (paths[1], lambda: draw.plot_slice(whole, varied, target_name="mean return")),
     ):
         with warnings.catch_warnings():

@@ -381,7 +381,7 @@ def test_evaluation_s_windows_reach_the_decision():
     trainer = make_trainer(source=make_source(40, 5), max_delay=3)
     assert list(trainer._held_out) == [0, 1, 2, 3]
     assert all(windows.valid[:, d].all() for d, windows in trainer._held_out.items())
-    # Episodes of five steps hold no decision that is six steps old.
+    # In an episode of five steps no decision comes five or six steps after an observation.
     assert list(make_trainer(source=make_source(40, 5), max_delay=6)._held_out) == [0, 1, 2, 3, 4]
 
 
