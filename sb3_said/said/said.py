@@ -98,7 +98,8 @@ class SAID(DelayedSAC):
     def _setup_model(self) -> None:
         super()._setup_model()
         self._planner_settings = asdict(self.policy.planner.config)
-        if self.env is not None and (reason := self._why_no_answer(process_of(self.env))):
+        is_new = self.trained_delay is None  # else it was loaded, and check_delay says what must be said
+        if is_new and self.env is not None and (reason := self._why_no_answer(process_of(self.env))):
             warnings.warn(reason, stacklevel=3)
 
     def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:

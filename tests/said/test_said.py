@@ -446,7 +446,11 @@ def test_a_planner_for_one_age_refuses_environments_of_others(delay, tmp_path):
         lambda: model.set_env(make_vec_env(lambda: delayed(delay, max_delay=2))),
         lambda: SAID.load(tmp_path / "agent", env=delayed(delay, max_delay=2), device="cpu"),
     ):
-        with pytest.raises(ValueError, match="mask='fixed' answers under delay=2 only, but this environment"):
+        with (
+            warnings.catch_warnings(),
+            pytest.raises(ValueError, match="mask='fixed' answers under delay=2 only, but this environment"),
+        ):
+            warnings.simplefilter("error")
             take()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
