@@ -13,13 +13,15 @@ from typing import Any
 
 import numpy as np
 import optuna
+from filelock import FileLock
 from optuna.distributions import CategoricalDistribution, FloatDistribution
 from optuna.importance import BaseImportanceEvaluator
 from optuna.storages import BaseStorage, JournalStorage, RDBStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, Trial, TrialState
 
-from sb3_said.said.tuning import Claim, DepthPlanners
+from sb3_said.common.locks import is_held, try_acquire, work_lock
+from sb3_said.said.tuning import DepthPlanners
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
 
@@ -112,7 +114,7 @@ class Search:
             begun = self._begin(planners)
             if begun is None:
                 break
-            trial, claim = begun
+            trial, lock = begun
             depth, temperature = trial.params["depth"], trial.params["temperature"]
             try:
                 planners.put(depth, temperature)
@@ -121,7 +123,7 @@ class Search:
                 self.study.tell(trial, state=TrialState.FAIL, skip_if_finished=True)
                 raise
             finally:
-                claim.release()
+                lock.release()
             pruned = "" if len(returns) == self.episodes else " (pruned)"
             print(
                 f"trial {trial.number}: depth {depth}, temperature {temperature:g}: mean return "
@@ -134,7 +136,7 @@ class Search:
     def running(self) -> list[FrozenTrial]:
         """Return the trials that a living worker is at."""
         trials = self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
-        return [trial for trial in trials if self._claim(trial).holder() is not None]
+        return [trial for trial in trials if is_held(self._trial_lock(trial))]
 
     def finished(self) -> list[FrozenTrial]:
         """Return the trials that are complete or pruned."""
@@ -145,13 +147,13 @@ class Search:
         complete = [trial for trial in self.finished() if trial.state == TrialState.COMPLETE]
         return max(complete, key=lambda t: (t.value, -t.params["depth"], -t.params["temperature"]), default=None)
 
-    def _begin(self, planners: DepthPlanners) -> tuple[Trial, Claim] | None:
+    def _begin(self, planners: DepthPlanners) -> tuple[Trial, FileLock] | None:
         with self._lock():
             for trial in self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
-                claim = self._claim(trial)
-                if claim.try_acquire():  # its worker died, and the cell is free again; or has ended since the list
+                lock = self._trial_lock(trial)
+                if try_acquire(lock):  # its worker died, and the cell is free again; or has ended since the list
                     self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
-                    claim.release()
+                    lock.release()
             taken = [trial for trial in self.study.get_trials(deepcopy=False) if trial.state != TrialState.FAIL]
             waiting = [trial for trial in taken if trial.state == TrialState.WAITING]
             if not waiting and len(taken) >= self.limit:
@@ -171,15 +173,15 @@ class Search:
             else:  # an int, so that depths can be added to a study later
                 begun.suggest_int("depth", min(self.depths), max(self.depths))
             begun.suggest_float("temperature", min(self.temperatures), max(self.temperatures))
-            claim = self._claim(begun)
-            claim.try_acquire()
-        return begun, claim
+            lock = self._trial_lock(begun)
+            lock.acquire()  # at once, but for another worker that looks whether it is held
+        return begun, lock
 
     def _next_cell(self, planners: DepthPlanners, taken: list[FrozenTrial]) -> tuple[int, float] | None:
         seen = {(t.params["depth"], t.params["temperature"]) for t in taken}
         left = [cell for depth in self.depths for t in self.temperatures if (cell := (depth, float(t))) not in seen]
-        busy = {depth: not planners.is_ready(depth) and planners.claim(depth).holder() is not None for depth, _ in left}
-        # A worker that has just begun a depth holds its claim a moment later; its running trial says so already.
+        busy = {depth: not planners.is_ready(depth) and is_held(planners.lock(depth)) for depth, _ in left}
+        # A worker that has just begun a depth holds its lock a moment later; its running trial says so already.
         running = {t.params["depth"] for t in taken if t.state == TrialState.RUNNING}
         rank = {d: 0 if planners.is_ready(d) else 2 if busy[d] or d in running else 1 for d in busy}
         return min(left, key=lambda cell: rank[cell[0]], default=None)
@@ -196,11 +198,11 @@ class Search:
         self.study.tell(trial, float(np.mean(returns)))
         return returns
 
-    def _lock(self) -> Claim:
-        return Claim(self.folder / "locks" / f"{self.name}.lock")
+    def _lock(self) -> FileLock:
+        return work_lock(self.folder / "locks" / f"{self.name}.lock")
 
-    def _claim(self, trial: Trial | FrozenTrial) -> Claim:
-        return Claim(self.folder / "locks" / f"{self.name}_trial{trial.number}.lock")
+    def _trial_lock(self, trial: Trial | FrozenTrial) -> FileLock:
+        return work_lock(self.folder / "locks" / f"{self.name}_trial{trial.number}.lock")
 
 
 def open_storage(storage: str) -> BaseStorage:

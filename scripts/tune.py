@@ -21,8 +21,9 @@ from winner import RunConfig
 from sb3_said import SAID
 from sb3_said.common.checkpoint import CHECKPOINT_NAME
 from sb3_said.common.files import write_json
+from sb3_said.common.locks import try_acquire, work_lock
 from sb3_said.evaluation import bootstrap_interval, rollout
-from sb3_said.said.tuning import Claim, DepthPlanners
+from sb3_said.said.tuning import DepthPlanners
 
 EPILOG = """\
 examples:
@@ -184,9 +185,9 @@ def tune(args: argparse.Namespace) -> None:
     winner = search.winner()
     if winner is None:
         raise ValueError("No trial is finished, so there is no winner: give more --timeout or --n-trials.")
-    reporting = Claim(folder / "locks" / "report.lock")
-    if not reporting.try_acquire():
-        print(f"Another worker reports ({reporting.holder()}).")
+    reporting = work_lock(folder / "locks" / "report.lock")
+    if not try_acquire(reporting):
+        print("Another worker reports.")
         return
     try:
         report(args, run, search, planners, winner, folder)

@@ -2,126 +2,28 @@
 
 from __future__ import annotations
 
-import json
-import os
-import socket
-import threading
-import time
-import uuid
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch as th
+from filelock import FileLock
 from stable_baselines3.common.logger import Logger, make_output_format
 
+from sb3_said.common.locks import try_acquire, work_lock
 from sb3_said.common.save_util import load_tree, save_tree
 from sb3_said.planner import InpaintingPlanner
 from sb3_said.planner.config import SAMPLING_SETTINGS, weight_settings
 from sb3_said.said.callbacks import PLANNER_CHECKPOINT_NAME, PlannerTrainingCallback
 from sb3_said.said.said import SAID
 
-STALE_AFTER = 120.0  # seconds without a sign of life
-HEARTBEAT = 10.0  # seconds between two signs of life
 TRIED_SETTINGS = ("depth", "temperature")  # of the planner, what a search varies
-
-
-class Claim:
-    """A file that says which process does a piece of work, so that no other process starts it too.
-
-    The file names host and process, and a thread touches it while the claim is held. The claim of a process that died
-    is free again: at once on the same host, after ``stale_after`` seconds on another that shares the folder. As a
-    context manager it waits until it is free.
-
-    :param path: of the file; all processes that share the work name the same one
-    :param stale_after: seconds without a touch after which the holder counts as dead
-    :param what: the work, for the line that is printed while waiting; nothing is printed without it
-    """
-
-    def __init__(self, path: str | Path, stale_after: float = STALE_AFTER, what: str | None = None):
-        self.path = Path(path)
-        self.stale_after = stale_after
-        self.what = what
-        self._content = json.dumps({"host": socket.gethostname(), "pid": os.getpid(), "token": uuid.uuid4().hex})
-        self._released = threading.Event()
-
-    def holder(self) -> str | None:
-        """Return who holds it, or None when nobody alive does."""
-        content = _read(self.path)
-        return None if content is None else self._living(content)
-
-    def try_acquire(self) -> bool:
-        """Take the claim if nobody alive holds it, and say whether that worked."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        content = _read(self.path)
-        if content is not None:
-            if self._living(content) is not None:
-                return False
-            self._remove_stale(content)
-        try:
-            with open(self.path, "x") as file:
-                file.write(self._content)
-        except FileExistsError:
-            return False
-        self._released = threading.Event()
-        threading.Thread(target=self._beat, args=(self._released,), daemon=True).start()
-        return True
-
-    def release(self) -> None:
-        """Give the claim back; does nothing when it is not held."""
-        self._released.set()
-        if _read(self.path) == self._content:
-            self.path.unlink(missing_ok=True)
-
-    def __enter__(self) -> Claim:
-        told = self.what is None
-        while not self.try_acquire():
-            if not told and (holder := self.holder()) is not None:
-                print(f"{self.what}: {holder} is at it; waiting.", flush=True)
-                told = True
-            time.sleep(0.05 if self.what is None else 1.0)
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.release()
-
-    def _living(self, content: str) -> str | None:
-        try:
-            silent = time.time() - self.path.stat().st_mtime
-        except FileNotFoundError:
-            return None
-        try:
-            holder = json.loads(content)
-        except json.JSONDecodeError:  # just made, not yet written
-            holder = {"host": "unknown", "pid": 0}
-        is_dead = holder["host"] == socket.gethostname() and not _is_alive(holder["pid"])
-        return None if is_dead or silent > self.stale_after else f"process {holder['pid']} on {holder['host']}"
-
-    def _remove_stale(self, content: str) -> None:
-        # Renamed first: of several processes that find it stale one gets it, and sees whether it is still the same.
-        aside = self.path.with_name(f"{self.path.name}.{uuid.uuid4().hex}")
-        try:
-            self.path.rename(aside)
-            if _read(aside) != content:
-                os.link(aside, self.path)
-        except (FileNotFoundError, FileExistsError):
-            pass
-        aside.unlink(missing_ok=True)
-
-    def _beat(self, released: threading.Event) -> None:
-        while not released.wait(min(HEARTBEAT, self.stale_after / 4)):
-            if _read(self.path) != self._content:
-                return
-            try:
-                os.utime(self.path)
-            except FileNotFoundError:
-                return
 
 
 class DepthPlanners:
     """Puts planners of any depth and temperature into an agent, training each depth at most once for all workers.
 
-    A depth's weights are kept in ``FOLDER/planner_depthN.zip``. Where that is missing, the worker that gets the claim
+    A depth's weights are kept in ``FOLDER/planner_depthN.zip``. Where that is missing, the worker that gets the lock
     trains it on the run's replay; others that need it wait. A training that died is continued from its checkpoint. The
     run's own planner serves its depth when it had as many updates.
 
@@ -159,9 +61,9 @@ class DepthPlanners:
         """Whether a depth is trained."""
         return self.path(depth).exists()
 
-    def claim(self, depth: int) -> Claim:
-        """Return the claim of the worker that trains a depth."""
-        return Claim(self.folder / "locks" / f"planner_depth{depth}.lock", what=f"The planner of depth {depth}")
+    def lock(self, depth: int) -> FileLock:
+        """Return the lock that a worker holds while it trains a depth."""
+        return work_lock(self.folder / "locks" / f"planner_depth{depth}.lock")
 
     def put(self, depth: int, temperature: float) -> None:
         """Let the agent answer with the planner of this depth and temperature, after training it if nobody has.
@@ -171,9 +73,7 @@ class DepthPlanners:
         if self._depth != depth:
             self._replace_planner(depth)
             if not self.is_ready(depth):
-                with self.claim(depth):
-                    if not self.is_ready(depth):
-                        self._train(depth)
+                self._train_once(depth)
             self._load(depth)
             self._depth = depth
         self.model.set_planner(temperature=temperature)
@@ -210,6 +110,18 @@ class DepthPlanners:
         model.planner_kwargs = {**(model.planner_kwargs or {}), "depth": depth}
         policy.set_training_mode(False)
         self._depth = None
+
+    def _train_once(self, depth: int) -> None:
+        """Train a depth, or wait for the worker that does."""
+        lock = self.lock(depth)
+        if not try_acquire(lock):
+            print(f"Another worker trains the planner of depth {depth}; waiting.", flush=True)
+            lock.acquire(poll_interval=1.0)
+        try:
+            if not self.is_ready(depth):
+                self._train(depth)
+        finally:
+            lock.release()
 
     def _train(self, depth: int) -> None:
         self._load_replay()
@@ -262,22 +174,3 @@ class DepthPlanners:
         policy = self.model.policy
         policy.planner.load_state_dict(saved["planner"])
         policy.planner_updates.fill_(float(self.gradient_steps))
-
-
-def _read(path: Path) -> str | None:
-    try:
-        return path.read_text()
-    except FileNotFoundError:
-        return None
-
-
-def _is_alive(pid: int) -> bool:
-    if os.name != "posix":  # elsewhere, os.kill does more than ask
-        return True
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        pass
-    return True

@@ -139,3 +139,9 @@ def test_a_study_begun_otherwise_is_refused(tmp_path: Path) -> None:
     make_search(tmp_path, [0.0], episodes=2)
     with pytest.raises(ValueError, match=r"episodes was 2 and is now 3.*--study-name"):
         make_search(tmp_path, [0.0], episodes=3)
+
+
+def test_how_planners_answered_is_told_by_its_settings(tmp_path: Path) -> None:
+    Search(tmp_path, str(tmp_path / "study.log"), "test", [2], [0.5], settings={"config": {"depth": 2, "steps": 1}})
+    with pytest.raises(ValueError, match=r"other settings: steps was 1 and is now 2\."):
+        Search(tmp_path, str(tmp_path / "study.log"), "test", [2], [0.5], settings={"config": {"depth": 2, "steps": 2}})
