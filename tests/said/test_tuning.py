@@ -6,8 +6,8 @@ import time
 from dataclasses import fields
 
 import pytest
+import small_agent
 import torch as th
-from small_task import delayed
 
 from sb3_said import SAID, PlannerConfig, PlannerTrainingCallback
 from sb3_said.common.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback
@@ -16,25 +16,13 @@ from sb3_said.said import tuning
 from sb3_said.said.tuning import DepthPlanners
 
 STEPS = 3
-PLANNER = {"d_model": 32, "depth": 1, "horizon": 3, "batch_size": 8, "sampling_steps": 1, "n_candidates": 2}
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A folder with a trained agent and the checkpoint of its training."""
     folder = tmp_path_factory.mktemp("run")
-    model = SAID(
-        "MlpPolicy",
-        delayed(),
-        learning_starts=20,
-        batch_size=16,
-        buffer_size=500,
-        seed=3,
-        device="cpu",
-        policy_kwargs={"net_arch": [16]},
-        planner_kwargs=PLANNER,
-        planner_gradient_steps=STEPS,
-    )
+    model = small_agent.make(seed=3, planner_kwargs={"batch_size": 8}, planner_gradient_steps=STEPS)
     model.learn(80, callback=TrainingCheckpointCallback(folder, 80))
     model.save(folder / "agent.zip")
     return folder
@@ -137,11 +125,11 @@ def test_planners_of_another_training_are_refused(run, tmp_path):
 def test_how_a_planner_answers_is_no_matter_of_its_training(run, tmp_path, trainings):
     first = make(run, tmp_path, 2)
     first.put(2, 0.5)
-    again = make(run, tmp_path, 2, n_candidates=3, sampling_steps=2)
+    again = make(run, tmp_path, 2, n_candidates=3, sampling_steps=4)
     again.put(2, 0.1)
     assert trainings == [2]  # the same weights, other answers
     config = again.model.policy.planner.config
-    assert (config.depth, config.temperature, config.n_candidates, config.sampling_steps) == (2, 0.1, 3, 2)
+    assert (config.depth, config.temperature, config.n_candidates, config.sampling_steps) == (2, 0.1, 3, 4)
     assert first.training_settings(2) == again.training_settings(2)
     # Returns of other answers cannot be compared.
     differing = first.trial_settings()["config"].items() ^ again.trial_settings()["config"].items()
