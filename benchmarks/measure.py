@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import platform
 import time
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_said.common.files import write_text
+from sb3_said.common import files
 from sb3_said.common.precision import compute_dtype
 from sb3_said.evaluation import Interval, bootstrap_interval
 
@@ -124,7 +123,7 @@ def write_json(path: Path | None, args: argparse.Namespace, rows: Sequence[Mappi
         return
     settings = {key: value for key, value in vars(args).items() if key != "json"}
     result = {"date": date.today().isoformat(), "settings": settings, "machine": machine(args.device)}
-    write_text(path, json.dumps({**result, "rows": list(rows), **more}, indent=1, default=_plain) + "\n")
+    files.write_json(path, {**result, "rows": list(rows), **more}, default=_plain)
 
 
 def machine(device: str | th.device = "cpu") -> dict[str, Any]:

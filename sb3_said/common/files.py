@@ -7,7 +7,7 @@ import glob
 import json
 import os
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
@@ -62,9 +62,10 @@ def write_text(path: Path, text: str) -> None:
         file.write(text.encode("utf-8"))
 
 
-def write_json(path: Path, document: Any) -> None:
+def write_json(path: Path, document: Any, default: Callable[[Any], Any] | None = None) -> None:
     """Write a JSON document, indented for its readers, as :func:`replacing` writes.
 
+    :param default: makes of what JSON does not know something that it knows
     :raises ValueError: if it holds NaN or an infinite number, which JSON lacks
     """
-    write_text(path, json.dumps(document, indent=2, allow_nan=False) + "\n")
+    write_text(path, json.dumps(document, indent=2, allow_nan=False, default=default) + "\n")
