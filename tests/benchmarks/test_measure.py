@@ -35,10 +35,12 @@ def test_ratio_is_the_median_of_the_turns():
 def test_the_rate_of_products_is_that_of_the_clock():
     rate = measure.matmul_rate("float32", seconds=0.05)
     a = np.ones((512, 512), np.float32)
-    began = time.perf_counter()
-    for _ in range(5):
+    seconds = []
+    for _ in range(10):
+        began = time.perf_counter()
         a @ a
-    numpys = 5 * 2 * 512**3 / (time.perf_counter() - began)
+        seconds.append(time.perf_counter() - began)
+    numpys = 2 * 512**3 / min(seconds)  # a busy machine makes the others as slow as it likes
     assert 0.1 < rate / numpys < 20  # another library, perhaps on another number of threads: the same order
 
 
