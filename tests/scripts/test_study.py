@@ -142,6 +142,9 @@ def test_a_study_begun_otherwise_is_refused(tmp_path: Path) -> None:
 
 
 def test_how_planners_answered_is_told_by_its_settings(tmp_path: Path) -> None:
-    Search(tmp_path, str(tmp_path / "study.log"), "test", [2], [0.5], settings={"config": {"depth": 2, "steps": 1}})
-    with pytest.raises(ValueError, match=r"other settings: steps was 1 and is now 2\."):
-        Search(tmp_path, str(tmp_path / "study.log"), "test", [2], [0.5], settings={"config": {"depth": 2, "steps": 2}})
+    before, now = ({"config": {"depth": 2, "n_candidates": n, "sampling_steps": n - 1}} for n in (2, 3))
+    make_search(tmp_path, [0.5], settings=before)
+    with pytest.raises(
+        ValueError, match=r"settings: n_candidates was 2 and is now 3; sampling_steps was 1 and is now 2\."
+    ):
+        make_search(tmp_path, [0.5], settings=now)

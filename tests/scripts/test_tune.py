@@ -60,7 +60,8 @@ def test_a_search_from_grid_to_report(
     monkeypatch.setattr(tune, "rollout", recorded)
     tune.main(command)
     # Once for two temperatures, and never the depth that the run itself has.
-    assert capsys.readouterr().out.count("Training the planner of depth") == 1
+    out = capsys.readouterr().out
+    assert out.count("Training the planner of depth") == out.count("Training the planner of depth 2:") == 1
     results = json.loads((run / "tune" / "results.json").read_text())
     cells = {(trial["depth"], trial["temperature"]) for trial in results["trials"]}
     assert len(results["trials"]) == 4 and cells == {(1, 0.0), (1, 1.0), (2, 0.0), (2, 1.0)}
