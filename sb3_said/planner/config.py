@@ -11,6 +11,7 @@ from sb3_said.planner import diffusion, dit, inpainting, normalizer
 
 SCORED_STATES = ("future", "decision", "all")
 LR_SCHEDULES = ("cosine", "constant")
+VALUE_SCALES = ("rank", "range")
 #: Settings that shape a planner's answers and none of its weights.
 SAMPLING_SETTINGS = ("solver", "time_grid", "sampling_steps", "n_candidates", "temperature", "scored_states")
 
@@ -35,6 +36,9 @@ class PlannerConfig:
     prediction: str = "v"  # measured: safe with few steps; or "epsilon" (paper), "x0"
     schedule: str = "cosine"  # measured; or "linear" (DV)
     time_sampling: str = "logit_normal"  # measured: lower error of the decoded present; or "uniform" (DV)
+    # Part of the training windows at the last time, where all is noise, every sampling starts and a single step ends;
+    # "logit_normal" alone hardly ever draws it. Measured; 0 is DV's; in [0, 1]
+    end_time_probability: float = 0.25
     mask: str = "random"  # one network for every delay; or "fixed" at max_delay (paper)
     mask_end_probability: float = 0.5  # a guess: the longest mask is the hardest; in [0, 1]
     # Part of the training windows that show more states than the first, any subset of those up to the decision index:
@@ -65,6 +69,9 @@ class PlannerConfig:
     ema_decay: float = 0.9999  # paper
     ema_warmup: bool = True  # without it 37 % of the initial weights remain after 10,000 steps
     weight_factor: float = 2.0  # paper: beta in the window weight exp(beta * (value - 1))
+    # What that value is: "rank", the part of all windows that are worth less, so that beta picks as much of any data
+    # (measured, results/README.md), or "range", between the lowest and the highest value of the data (paper)
+    value_scale: str = "rank"
     precision: str = "auto"  # bfloat16 autocast where the hardware has it; or "float32", "bfloat16"
 
     def __post_init__(self) -> None:
@@ -79,6 +86,7 @@ class PlannerConfig:
             ("time_grid", diffusion.TIME_GRIDS),
             ("scored_states", SCORED_STATES),
             ("lr_schedule", LR_SCHEDULES),
+            ("value_scale", VALUE_SCALES),
             ("precision", precision.PRECISIONS),
         ):
             check_choice(name, getattr(self, name), choices)
@@ -95,7 +103,7 @@ class PlannerConfig:
                 f"learning_rate is {self.learning_rate} and gradient_clip {self.gradient_clip}, expected positive "
                 "numbers; to switch clipping off, give gradient_clip=None."
             )
-        for name in ("mask_end_probability", "extra_state_probability", "ema_decay"):
+        for name in ("end_time_probability", "mask_end_probability", "extra_state_probability", "ema_decay"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected a number in [0, 1].")
 
@@ -115,6 +123,7 @@ class PlannerConfig:
             prediction="epsilon",
             schedule="linear",
             time_sampling="uniform",
+            end_time_probability=0.0,
             mask="fixed",
             relative_states=False,
             decision_weight=1.0,
@@ -128,6 +137,7 @@ class PlannerConfig:
             batch_size=256,
             gradient_clip=None,
             ema_warmup=False,
+            value_scale="range",
             precision="float32",
         )
         return replace(config, **changes)  # type: ignore[arg-type]

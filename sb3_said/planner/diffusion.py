@@ -79,11 +79,17 @@ def to_noise(
 
 
 def draw_times(
-    n: int, schedule: str, time_sampling: str, generator: th.Generator | None = None, device: th.device | str = "cpu"
+    n: int,
+    schedule: str,
+    time_sampling: str,
+    end_probability: float = 0.0,
+    generator: th.Generator | None = None,
+    device: th.device | str = "cpu",
 ) -> th.Tensor:
     """Draw training times: (n,) float32 in [START_TIME, END_TIMES[schedule]].
 
     :param time_sampling: ``"uniform"`` (the paper's) or ``"logit_normal"`` (Esser et al. 2024), more in the middle
+    :param end_probability: part of the times that are the last one, where every sampling starts
     """
     check_choice("schedule", schedule, SCHEDULES)
     check_choice("time_sampling", time_sampling, TIME_SAMPLINGS)
@@ -92,6 +98,8 @@ def draw_times(
         fraction = th.rand(n, generator=generator, device=source)
     else:
         fraction = th.randn(n, generator=generator, device=source).sigmoid()
+    if end_probability > 0:
+        fraction = th.where(th.rand(n, generator=generator, device=source) < end_probability, 1.0, fraction)
     return (START_TIME + (END_TIMES[schedule] - START_TIME) * fraction).to(device)
 
 

@@ -140,7 +140,9 @@ class InpaintingPlanner(nn.Module):
         known = inpainting.known_mask(delay, self.window_length, self.obs_dim, self.act_dim, state_known)
         known = known & valid[..., None]
         noise = self._noise(clean.shape, generator)
-        t = diffusion.draw_times(n, config.schedule, config.time_sampling, generator, device)
+        t = diffusion.draw_times(
+            n, config.schedule, config.time_sampling, config.end_time_probability, generator, device
+        )
         alpha, sigma = (factor[:, None, None] for factor in diffusion.alpha_sigma(t, config.schedule))
         x = th.where(known, clean, diffusion.add_noise(clean, noise, alpha, sigma))
         with self.autocast():

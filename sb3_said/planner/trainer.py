@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch as th
@@ -49,6 +50,16 @@ def value_weight(values: th.Tensor, weight_factor: float) -> th.Tensor:
     :param weight_factor: beta; 0 weighs all windows alike
     """
     return th.exp(weight_factor * (values - 1.0))
+
+
+def value_rank(values: th.Tensor) -> th.Tensor:
+    """Return the part of the others that each value is above, equal ones counted half: (M,) in [0, 1].
+
+    :param values: (M,)
+    """
+    ordered = values.sort().values
+    below, up_to = th.searchsorted(ordered, values), th.searchsorted(ordered, values, right=True)  # (M,)
+    return (below + up_to - 1) / (2 * max(1, len(values) - 1))
 
 
 def worse_than_regression(errors: dict[str, float], tolerance: float = 0.05) -> str:
@@ -121,6 +132,8 @@ class PlannerTrainer:
         }
 
         training_source, held_source = source.split(held_out, seed) if held_out > 0 else (source, None)
+        if self.config.value_scale == "rank":
+            training_source = replace(training_source, values=value_rank(training_source.values))
         self.source = training_source.to(self.device)
         windows = self.source.sample(N_NORMALIZER_WINDOWS, planner.window_length, self.generator)
         planner.fit_normalizer(self.source.start_states(), self.source.start_actions(), windows)

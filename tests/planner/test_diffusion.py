@@ -72,13 +72,23 @@ def test_predictions_give_back_what_the_sample_was_made_of(prediction, t, clean,
 @pytest.mark.parametrize("time_sampling", diffusion.TIME_SAMPLINGS)
 @pytest.mark.parametrize("schedule", diffusion.SCHEDULES)
 def test_training_times_fill_their_range(time_sampling, schedule):
-    t = diffusion.draw_times(20_000, schedule, time_sampling, th.Generator().manual_seed(0))
+    t = diffusion.draw_times(20_000, schedule, time_sampling, generator=th.Generator().manual_seed(0))
     low, high = diffusion.START_TIME, diffusion.END_TIMES[schedule]
     assert t.dtype == th.float32 and t.min() >= low and t.max() <= high
     fraction = (t - low) / (high - low)
     logit = (fraction / (1 - fraction)).log()
     spread = logit.std() if time_sampling == "logit_normal" else fraction.std() * math.sqrt(12)
     assert spread.item() == pytest.approx(1.0, abs=0.03) and fraction.mean().item() == pytest.approx(0.5, abs=0.01)
+
+
+@pytest.mark.parametrize("time_sampling", diffusion.TIME_SAMPLINGS)
+def test_a_part_of_the_training_times_is_where_sampling_starts(time_sampling):
+    for schedule in diffusion.SCHEDULES:
+        start = diffusion.solver_times(5, schedule)[0]
+        t = diffusion.draw_times(20_000, schedule, time_sampling, 0.25, th.Generator().manual_seed(0))
+        assert (t == start).float().mean().item() == pytest.approx(0.25, abs=0.01)
+        others = diffusion.draw_times(20_000, schedule, time_sampling, 0.0, th.Generator().manual_seed(0))
+        assert th.equal(t[t < start], others[t < start])
 
 
 @pytest.mark.parametrize("schedule", diffusion.SCHEDULES)

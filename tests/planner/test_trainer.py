@@ -10,13 +10,23 @@ import math
 import numpy as np
 import pytest
 import torch as th
+from hypothesis import given
+from hypothesis import strategies as st
 from linear_system import ACTION_DIM, STATE_DIM, make_source
 
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
+from sb3_said.planner.config import VALUE_SCALES
 from sb3_said.planner.diffusion import alpha_sigma, draw_times
 from sb3_said.planner.dit import HEAD_DIM
 from sb3_said.planner.inpainting import draw_delays
-from sb3_said.planner.trainer import PlannerTrainer, ema_decay, learning_rate, value_weight, worse_than_regression
+from sb3_said.planner.trainer import (
+    PlannerTrainer,
+    ema_decay,
+    learning_rate,
+    value_rank,
+    value_weight,
+    worse_than_regression,
+)
 
 D = 3
 
@@ -56,6 +66,30 @@ def test_value_weight():
     expected = [math.exp(-2.0), math.exp(-1.5), 1.0]
     np.testing.assert_allclose(value_weight(values, 2.0), expected, rtol=1e-6)
     np.testing.assert_array_equal(value_weight(values, 0.0), np.ones(3))
+
+
+@given(st.lists(st.integers(-3, 3), min_size=1, max_size=30))
+def test_value_rank(values):
+    others = np.array(values)[:, None]  # (M, 1)
+    above = (others > values).sum(1) + ((others == values).sum(1) - 1) / 2
+    ranks = value_rank(th.tensor(values, dtype=th.float32))
+    np.testing.assert_allclose(ranks, above / max(1, len(values) - 1), rtol=1e-6)
+
+
+def test_ranks_weigh_alike_whatever_the_scale_of_values():
+    """One beta picks as much of data that is mostly bad as of data that is mostly good."""
+    values = th.rand(1000, generator=th.Generator().manual_seed(0), dtype=th.float64)
+    weights = value_weight(value_rank(values), 2.0)
+    for other in (values**4, 1 - (1 - values) ** 4, 5 * values - 3):
+        th.testing.assert_close(value_weight(value_rank(other), 2.0), weights)
+
+
+@pytest.mark.parametrize("scale", VALUE_SCALES)
+def test_windows_are_weighed_by_rank_or_range(scale):
+    trainer = make_trainer(value_scale=scale)
+    plain = make_trainer(value_scale="range").source
+    expected = value_rank(plain.values) if scale == "rank" else plain.values
+    assert th.equal(trainer.source.values, expected) and th.equal(trainer.source.rows, plain.rows)
 
 
 def test_loss_receives_the_weights(monkeypatch):
@@ -100,6 +134,7 @@ OTHER_SETTINGS = {
     "prediction": "epsilon",
     "schedule": "linear",
     "time_sampling": "uniform",
+    "end_time_probability": 0.9,
     "mask": "fixed",
     "mask_end_probability": 0.0,
     "extra_state_probability": 0.9,
@@ -122,6 +157,7 @@ OTHER_SETTINGS = {
     "ema_decay": 0.05,
     "ema_warmup": False,
     "weight_factor": 0.5,
+    "value_scale": "range",
     "precision": "bfloat16",
 }
 
@@ -217,7 +253,7 @@ def naive_loss(planner, source, config, generator):
     starts = th.randint(len(source), (n,), generator=generator)
     delays = draw_delays(n, planner.max_delay, config.mask, config.mask_end_probability, generator)
     noise = th.randn(n, length, STATE_DIM + ACTION_DIM, generator=generator)
-    times = draw_times(n, config.schedule, config.time_sampling, generator)
+    times = draw_times(n, config.schedule, config.time_sampling, config.end_time_probability, generator)
     error, total = 0.0, 0.0
     for start, d, eps, t in zip(starts.tolist(), delays.tolist(), noise.double(), times.double(), strict=True):
         steps = range(min(d + config.horizon, int(source.remaining[start])))
@@ -233,7 +269,9 @@ def naive_loss(planner, source, config, generator):
         share = (~known).double()
         if d in steps:
             share[d] *= config.decision_weight
-        error = error + ((output - v) ** 2 * share).sum() * math.exp(config.weight_factor * (source.values[start] - 1))
+        worse, alike = (compare(source.values, source.values[start]).sum().item() for compare in (th.lt, th.eq))
+        rank = (worse + (alike - 1) / 2) / (len(source) - 1)
+        error = error + ((output - v) ** 2 * share).sum() * math.exp(config.weight_factor * (rank - 1))
         total += share.sum()
     return error / total
 

@@ -352,7 +352,8 @@ def test_the_newest_part_of_the_buffer():
 
 @pytest.mark.parametrize("penalty", [-100.0, None])
 def test_what_an_end_is_worth(penalty):
-    model = make(delayed(truncates=False), planner_terminal_penalty=penalty).learn(60)
+    kwargs = {"planner_terminal_penalty": penalty, "planner_kwargs": {"value_scale": "range"}}
+    model = make(delayed(truncates=False), **kwargs).learn(60)
     ends = model.replay_buffer.dones[:60, 0] > 0
     model.replay_buffer.rewards[:60][ends] = 500.0  # the task is done
     source = model.make_planner_trainer().source
