@@ -1,4 +1,4 @@
-"""A search over planner depth and temperature that several workers share, kept in an Optuna study."""
+"""A search over settings of the planner that several workers share, kept in an Optuna study."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import optuna
 from filelock import FileLock
-from optuna.distributions import CategoricalDistribution, FloatDistribution
+from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution
 from optuna.importance import BaseImportanceEvaluator
 from optuna.storages import BaseStorage, JournalStorage, RDBStorage
 from optuna.storages.journal import JournalFileBackend
@@ -31,7 +32,7 @@ Play = Callable[[int, int], Sequence[float]]
 
 @dataclass
 class Search:
-    """Depths and temperatures tried on the same episodes, the best mean return wins.
+    """Settings of the planner tried on the same episodes, the best mean return wins.
 
     With the sampler ``grid`` every cell is tried once. The cells are handed out here, as Optuna's ``GridSampler`` now
     and then gives two workers the same one, and does not know that a depth is being trained: a worker takes a trained
@@ -43,6 +44,7 @@ class Search:
     :param folder: shared by the workers, for their locks
     :param storage: an Optuna RDB URL, or the path of a journal file
     :param name: of the study
+    :param tried: values of ``depth``, ``temperature`` and ``sampling_steps``
     :param settings: in JSON types, what all trials must have in common to be compared
     :param n_trials: of the whole study, over all workers
     :param episodes: of a trial
@@ -55,8 +57,7 @@ class Search:
     folder: Path
     storage: str
     name: str
-    depths: list[int]
-    temperatures: list[float]
+    tried: dict[str, list[Any]]
     sampler: str = "grid"
     n_trials: int | None = None
     episodes: int = 20
@@ -68,7 +69,8 @@ class Search:
     def __post_init__(self) -> None:
         common = {**self.settings, "sampler": self.sampler, "episodes": self.episodes, "seed": self.seed}
         if self.sampler == "tpe":
-            common |= {"depths": self.depths, "temperatures": [min(self.temperatures), max(self.temperatures)]}
+            temperatures = self.tried["temperature"]
+            common |= {**self.tried, "temperature": [min(temperatures), max(temperatures)]}
         pruner: optuna.pruners.BasePruner = optuna.pruners.NopPruner()
         if self.prune > 0:
             with warnings.catch_warnings():
@@ -100,7 +102,7 @@ class Search:
         """Trials that the study may have; a grid ends by itself."""
         if self.n_trials is not None:
             return self.n_trials
-        return math.inf if self.sampler == "grid" else len(self.depths) * len(self.temperatures)
+        return math.inf if self.sampler == "grid" else math.prod(map(len, self.tried.values()))
 
     def work(self, planners: DepthPlanners, play: Play, deadline: float | None = None) -> int:
         """Make trials until there is none left to begin, and return how many were made.
@@ -115,9 +117,8 @@ class Search:
             if begun is None:
                 break
             trial, lock = begun
-            depth, temperature = trial.params["depth"], trial.params["temperature"]
             try:
-                planners.put(depth, temperature)
+                planners.put(**trial.params)
                 returns = self._play(trial, play)
             except BaseException:
                 self.study.tell(trial, state=TrialState.FAIL, skip_if_finished=True)
@@ -126,8 +127,8 @@ class Search:
                 lock.release()
             pruned = "" if len(returns) == self.episodes else " (pruned)"
             print(
-                f"trial {trial.number}: depth {depth}, temperature {temperature:g}: mean return "
-                f"{np.mean(returns):,.1f} over {len(returns)} episodes{pruned}",
+                f"trial {trial.number}: {describe(trial.params)}: mean return {np.mean(returns):,.1f} over "
+                f"{len(returns)} episodes{pruned}",
                 flush=True,
             )
             made += 1
@@ -143,9 +144,9 @@ class Search:
         return self.study.get_trials(states=(TrialState.COMPLETE, TrialState.PRUNED))
 
     def winner(self) -> FrozenTrial | None:
-        """Return the complete trial of the highest mean; of equals, the shallowest and coldest."""
+        """Return the complete trial of the highest mean; of equals, the shallowest, coldest and quickest."""
         complete = [trial for trial in self.finished() if trial.state == TrialState.COMPLETE]
-        return max(complete, key=lambda t: (t.value, -t.params["depth"], -t.params["temperature"]), default=None)
+        return max(complete, key=lambda t: (t.value, *(-t.params[name] for name in self.tried)), default=None)
 
     def _begin(self, planners: DepthPlanners) -> tuple[Trial, FileLock] | None:
         with self._lock():
@@ -166,25 +167,29 @@ class Search:
                 cell = self._next_cell(planners, taken)
                 if cell is None:
                     return None
-                self.study.enqueue_trial({"depth": cell[0], "temperature": cell[1]}, {"worker": os.getpid()})
+                self.study.enqueue_trial(cell, {"worker": os.getpid()})
             begun = self.study.ask()
-            if self.sampler == "tpe":
-                begun.suggest_categorical("depth", self.depths)
-            else:  # an int, so that depths can be added to a study later
-                begun.suggest_int("depth", min(self.depths), max(self.depths))
-            begun.suggest_float("temperature", min(self.temperatures), max(self.temperatures))
+            for name, values in self.tried.items():
+                if name == "temperature":
+                    begun.suggest_float(name, min(values), max(values))
+                elif self.sampler == "tpe":
+                    begun.suggest_categorical(name, values)
+                else:  # an int, so that others can be added to a study later
+                    begun.suggest_int(name, min(values), max(values))
             lock = self._trial_lock(begun)
             lock.acquire()  # at once, but for another worker that looks whether it is held
         return begun, lock
 
-    def _next_cell(self, planners: DepthPlanners, taken: list[FrozenTrial]) -> tuple[int, float] | None:
-        seen = {(t.params["depth"], t.params["temperature"]) for t in taken}
-        left = [cell for depth in self.depths for t in self.temperatures if (cell := (depth, float(t))) not in seen]
-        busy = {depth: not planners.is_ready(depth) and is_held(planners.lock(depth)) for depth, _ in left}
+    def _next_cell(self, planners: DepthPlanners, taken: list[FrozenTrial]) -> dict[str, Any] | None:
+        seen = [trial.params for trial in taken]
+        cells = (dict(zip(self.tried, values, strict=True)) for values in product(*self.tried.values()))
+        left = [cell for cell in cells if cell not in seen]
+        depths = {cell["depth"] for cell in left}
+        busy = {depth: not planners.is_ready(depth) and is_held(planners.lock(depth)) for depth in depths}
         # A worker that has just begun a depth holds its lock a moment later; its running trial says so already.
         running = {t.params["depth"] for t in taken if t.state == TrialState.RUNNING}
         rank = {d: 0 if planners.is_ready(d) else 2 if busy[d] or d in running else 1 for d in busy}
-        return min(left, key=lambda cell: rank[cell[0]], default=None)
+        return min(left, key=lambda cell: rank[cell["depth"]], default=None)
 
     def _play(self, trial: Trial, play: Play) -> list[float]:
         returns: list[float] = []
@@ -213,6 +218,11 @@ def open_storage(storage: str) -> BaseStorage:
         return RDBStorage(storage, engine_kwargs=patience)
     Path(storage).parent.mkdir(parents=True, exist_ok=True)
     return JournalStorage(JournalFileBackend(storage))
+
+
+def describe(params: Mapping[str, float]) -> str:
+    """Write what was tried, such as "depth 2, temperature 0.3, sampling steps 5"."""
+    return ", ".join(f"{name.replace('_', ' ')} {value:g}" for name, value in params.items())
 
 
 def returns_of(trial: FrozenTrial) -> list[float]:
@@ -262,23 +272,20 @@ def save_plots(search: Search, folder: Path) -> list[Path]:
     from optuna.visualization import matplotlib as draw
 
     trials = search.finished()
-    levels: dict[str, list[Any]] = {
-        "depth": sorted({t.params["depth"] for t in trials}),
-        "temperature": sorted({t.params["temperature"] for t in trials}),
-    }
+    levels: dict[str, list[Any]] = {name: sorted({t.params[name] for t in trials}) for name in search.tried}
     varied = [name for name, values in levels.items() if len(values) > 1]
     if not varied:
         return []
     whole = optuna.create_study(direction="maximize")
     for trial in trials:
-        distributions = {
-            "depth": CategoricalDistribution(levels["depth"]),
-            "temperature": FloatDistribution(levels["temperature"][0], levels["temperature"][-1]),
+        distributions: dict[str, BaseDistribution] = {
+            name: FloatDistribution(values[0], values[-1]) if name == "temperature" else CategoricalDistribution(values)
+            for name, values in levels.items()
         }
         value = float(np.mean(returns_of(trial)))
         whole.add_trial(optuna.trial.create_trial(value=value, params=trial.params, distributions=distributions))
     # Of any temperature there are as many levels as were named; a grid's are those of all its workers.
-    bins = {**levels, "temperature": search.temperatures} if search.sampler == "tpe" else levels
+    bins = {**levels, "temperature": search.tried["temperature"]} if search.sampler == "tpe" else levels
     effects = MainEffects({name: bins[name] for name in varied})
     paths = [folder / "importance.png", folder / "slice.png"]
     for path, drawing in (

@@ -1,4 +1,4 @@
-"""Search the planner's depth and temperature for a trained SAID run, sharing its expert and its replay."""
+"""Search the planner's depth, temperature and denoising steps for a trained SAID run, sharing its expert and replay."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import torch as th
 from evaluate import evaluate
 from optuna.trial import FrozenTrial
 from runs import LoadedRun, load_run, origin
-from study import Search, returns_of, save_plots
+from study import Search, describe, returns_of, save_plots
 from winner import RunConfig
 
 from sb3_said import SAID
@@ -37,6 +37,9 @@ examples:
   # a quick look: one depth, fewer updates, fewer episodes, into a folder of its own
   python scripts/tune.py --run logs/said/Hopper-v5-delay4_1 --depths 2 --gradient-steps 5000 --episodes 10 \\
       --output look
+
+  # one denoising step is the mean of the likely plans: worse on one task, better and five times as fast on another
+  python scripts/tune.py --run logs/said/HalfCheetah-v5-delay0-16_1 --depths 2 --temperatures 0 --sampling-steps 1 2 5
 
   # any temperature from 0 to 1, in a data base
   python scripts/tune.py --run logs/said/Hopper-v5-delay4_1 --sampler tpe --n-trials 30 --storage sqlite:///tune.db
@@ -69,6 +72,9 @@ def make_parser() -> argparse.ArgumentParser:
         default=[0.0, 0.1, 0.3, 0.6, 0.8, 1.0],
         metavar="T",
         help="default: 0 0.1 0.3 0.6 0.8 1",
+    )
+    parser.add_argument(
+        "--sampling-steps", type=int, nargs="+", metavar="N", help="denoising steps (default: as the run's)"
     )
     parser.add_argument("--sampler", choices=("grid", "tpe"), default="grid", help="default: grid, every cell once")
     parser.add_argument("--n-trials", type=int, help="trials of the whole study (default: as many as the grid has)")
@@ -127,10 +133,11 @@ def check(args: argparse.Namespace) -> None:
         raise ValueError(f"--prune is a p-value in [0, 1), got {args.prune}; 0 prunes nothing.")
     if args.prune > 0 and find_spec("scipy") is None:
         raise ValueError("Pruning needs SciPy: pip install scipy, or give --prune 0.")
-    for name in ("depths", "temperatures"):
-        values = getattr(args, name)
+    for name in ("depths", "temperatures", "sampling_steps"):
+        values = getattr(args, name) or []
         if len(set(values)) < len(values):
-            raise ValueError(f"--{name} names a value twice: {' '.join(f'{value:g}' for value in values)}.")
+            option = name.replace("_", "-")
+            raise ValueError(f"--{option} names a value twice: {' '.join(f'{value:g}' for value in values)}.")
     if args.seed < args.report_seed + args.report_episodes and args.report_seed < args.seed + args.episodes:
         raise ValueError(
             f"Tuning would play the reset seeds {args.seed}..{args.seed + args.episodes - 1} and the report "
@@ -147,16 +154,20 @@ def tune(args: argparse.Namespace) -> None:
     run, model = open_run(args)
     folder = args.output or args.run / "tune"
     planners = DepthPlanners(model, args.run / CHECKPOINT_NAME, folder, args.gradient_steps, args.progress)
-    for depth in args.depths:
-        for temperature in args.temperatures:
-            replace(planners.config, depth=depth, temperature=temperature)
+    tried = {
+        "depth": args.depths,
+        "temperature": args.temperatures,
+        "sampling_steps": args.sampling_steps or [planners.config.sampling_steps],
+    }
+    for name, values in tried.items():
+        for value in values:
+            replace(planners.config, **{name: value})
     settings = {**planners.trial_settings(), "env": run.info["env"], "delay": run.info["delay"]}
     search = Search(
         folder,
         args.storage or str(folder / "study.log"),
         args.study_name or args.run.resolve().name,
-        args.depths,
-        args.temperatures,
+        tried,
         args.sampler,
         args.n_trials,
         args.episodes,
@@ -222,7 +233,7 @@ def report(
     folder: Path,
 ) -> None:
     """Play the winner and the expert on fresh episodes and write everything that the search found."""
-    planners.put(winner.params["depth"], winner.params["temperature"])
+    planners.put(**winner.params)
     fresh = {
         "study": search.name,
         "trial": winner.number,
@@ -260,9 +271,8 @@ def report(
     write_json(results, document)
 
     pruned = sum(trial["state"] == "PRUNED" for trial in trials)
-    print(f"\n{len(trials)} trials, {pruned} of them pruned. Best: depth {winner.params['depth']}, "
-          f"temperature {winner.params['temperature']:g}, mean return {winner.value:,.1f} on the episodes it was "
-          "chosen by.")  # fmt: skip
+    print(f"\n{len(trials)} trials, {pruned} of them pruned. Best: {describe(winner.params)}, mean return "
+          f"{winner.value:,.1f} on the episodes it was chosen by.")  # fmt: skip
     print(f"On {args.report_episodes} other episodes:")
     for one in played:
         mean = one["mean_return"]

@@ -56,14 +56,14 @@ class RunConfig:
         """Write best.yml for train.py, and the YAML that evaluate.py reads beside best.zip.
 
         :param folder: to write to
-        :param planner: depth and temperature
+        :param planner: its settings that were tried
         :param choice: how they were chosen, for a comment
         :return: names of hyper-parameters that YAML cannot hold
         """
         block, left_out = self.block(planner)
         document = {self.env_id: block, "presets": {name: {"default": {}} for name in PRESETS if name != "cpu"}}
         lines = [
-            f"Depth and temperature: {choice}; see results.json.",
+            f"{', '.join(planner)}: {choice}; see results.json.",
             self.train_command(folder),
             *(f"Left out, as YAML cannot hold it: {name}" for name in left_out),
             "The block is whole: presets change nothing in it.",
@@ -84,7 +84,7 @@ class RunConfig:
         The wrapper of the delay is left out, since ``--delay`` adds it; what the command line set beside the
         hyper-parameters is taken in.
 
-        :param planner: depth and temperature
+        :param planner: its settings that were tried
         :return: the block, and the names of hyper-parameters that YAML cannot hold
         """
         block, left_out = {}, []

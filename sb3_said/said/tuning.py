@@ -1,4 +1,4 @@
-"""A run's planners of several depths, each trained once, however many workers and temperatures ask for it."""
+"""A run's planners of several depths, each trained once, however many workers and trials ask for it."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from sb3_said.planner.config import SAMPLING_SETTINGS, weight_settings
 from sb3_said.said.callbacks import PLANNER_CHECKPOINT_NAME, PlannerTrainingCallback
 from sb3_said.said.said import SAID
 
-TRIED_SETTINGS = ("depth", "temperature")  # of the planner, what a search varies
+TRIED_SETTINGS = ("depth", "temperature", "sampling_steps")  # of the planner, what a search varies
 
 
 class DepthPlanners:
-    """Puts planners of any depth and temperature into an agent, training each depth at most once for all workers.
+    """Puts planners of any depth into an agent, training each at most once for all workers.
 
     A depth's weights are kept in ``FOLDER/planner_depthN.zip``. Where that is missing, the worker that gets the lock
     trains it on the run's replay; others that need it wait. A training that died is continued from its checkpoint. The
@@ -65,9 +65,10 @@ class DepthPlanners:
         """Return the lock that a worker holds while it trains a depth."""
         return work_lock(self.folder / "locks" / f"planner_depth{depth}.lock")
 
-    def put(self, depth: int, temperature: float) -> None:
-        """Let the agent answer with the planner of this depth and temperature, after training it if nobody has.
+    def put(self, depth: int, **sampling: Any) -> None:
+        """Let the agent answer with the planner of this depth, after training it if nobody has.
 
+        :param sampling: how it answers, see :meth:`~sb3_said.said.SAID.set_planner`
         :raises ValueError: when the planner or the replay in the folder is of another training
         """
         if self._depth != depth:
@@ -76,7 +77,7 @@ class DepthPlanners:
                 self._train_once(depth)
             self._load(depth)
             self._depth = depth
-        self.model.set_planner(temperature=temperature)
+        self.model.set_planner(**sampling)
 
     def training_settings(self, depth: int) -> dict[str, Any]:
         """Return what decides a depth's weights, in JSON types: how the planner answers does not."""
@@ -91,7 +92,7 @@ class DepthPlanners:
         }
 
     def trial_settings(self) -> dict[str, Any]:
-        """Return what trials must share to be compared, in JSON types: all but the depth and the temperature they try.
+        """Return what trials must share to be compared, in JSON types: all but what they try.
 
         How the planner answers is part of it: more candidates, for one, earn other returns with the same weights.
         """

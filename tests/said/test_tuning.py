@@ -56,16 +56,16 @@ def same_planner(first, second):
 def test_each_depth_is_trained_once_and_never_the_runs_own(run, tmp_path, trainings):
     planners = make(run, tmp_path)
     for depth, temperature in ((1, 0.5), (2, 0.5), (1, 0.0), (2, 0.0)):
-        planners.put(depth, temperature)
+        planners.put(depth, temperature=temperature)
         config = planners.model.policy.planner.config
         assert (config.depth, config.temperature) == (depth, temperature)
     assert trainings == [2]
-    make(run, tmp_path).put(2, 0.5)
+    make(run, tmp_path).put(2, temperature=0.5)
     assert trainings == [2]
 
 
 def test_a_worker_waits_for_the_one_that_trains(run, tmp_path, trainings, capsys):
-    make(run, tmp_path / "ready").put(2, 0.5)
+    make(run, tmp_path / "ready").put(2, temperature=0.5)
     planners = make(run, tmp_path / "shared")
     began = threading.Event()
 
@@ -77,14 +77,14 @@ def test_a_worker_waits_for_the_one_that_trains(run, tmp_path, trainings, capsys
 
     threading.Thread(target=train_elsewhere).start()
     assert began.wait(10)
-    planners.put(2, 0.5)
+    planners.put(2, temperature=0.5)
     assert trainings == [2]  # the first one
     assert "Another worker trains the planner of depth 2; waiting." in capsys.readouterr().out
 
 
 def test_a_killed_training_goes_on_bit_for_bit(run, tmp_path, monkeypatch):
     whole = make(run, tmp_path / "whole", 6)
-    whole.put(2, 0.5)
+    whole.put(2, temperature=0.5)
     callback = functools.partial(PlannerTrainingCallback, save_interval=2)
     monkeypatch.setattr(tuning, "PlannerTrainingCallback", callback)
     halved = make(run, tmp_path / "halved", 6)
@@ -105,11 +105,11 @@ def test_a_killed_training_goes_on_bit_for_bit(run, tmp_path, monkeypatch):
 
     monkeypatch.setattr(SAID, "make_planner_trainer", stopping)
     with pytest.raises(KeyboardInterrupt):
-        halved.put(2, 0.5)
+        halved.put(2, temperature=0.5)
     assert not halved.is_ready(2) and not is_held(halved.lock(2))
     monkeypatch.setattr(SAID, "make_planner_trainer", make_trainer)
     again = make(run, tmp_path / "halved", 6)
-    again.put(2, 0.5)
+    again.put(2, temperature=0.5)
     same_planner(whole, again)
     # The expert is the run's, whatever the planner.
     expert = SAID.load(run / "agent.zip", device="cpu").policy.actor.state_dict()
@@ -117,29 +117,29 @@ def test_a_killed_training_goes_on_bit_for_bit(run, tmp_path, monkeypatch):
 
 
 def test_planners_of_another_training_are_refused(run, tmp_path):
-    make(run, tmp_path, 2).put(2, 0.5)
+    make(run, tmp_path, 2).put(2, temperature=0.5)
     with pytest.raises(ValueError, match=r"gradient_steps was 2 and is now 4.*delete the file"):
-        make(run, tmp_path, 4).put(2, 0.5)
+        make(run, tmp_path, 4).put(2, temperature=0.5)
 
 
 def test_how_a_planner_answers_is_no_matter_of_its_training(run, tmp_path, trainings):
     first = make(run, tmp_path, 2)
-    first.put(2, 0.5)
-    again = make(run, tmp_path, 2, n_candidates=3, sampling_steps=4)
-    again.put(2, 0.1)
+    first.put(2, temperature=0.5)
+    again = make(run, tmp_path, 2, n_candidates=3, solver="dpmsolver++2m")
+    again.put(2, temperature=0.1, sampling_steps=4)
     assert trainings == [2]  # the same weights, other answers
     config = again.model.policy.planner.config
     assert (config.depth, config.temperature, config.n_candidates, config.sampling_steps) == (2, 0.1, 3, 4)
     assert first.training_settings(2) == again.training_settings(2)
     # Returns of other answers cannot be compared.
     differing = first.trial_settings()["config"].items() ^ again.trial_settings()["config"].items()
-    assert {name for name, _ in differing} == {"n_candidates", "sampling_steps"}
+    assert {name for name, _ in differing} == {"n_candidates", "solver"}
 
 
 def test_an_agent_with_a_planner_put_in_is_saved_with_it(run, tmp_path):
     planners = make(run, tmp_path, 2)
     for depth, temperature in ((2, 0.3), (3, 0.0), (2, 0.7)):
-        planners.put(depth, temperature)
+        planners.put(depth, temperature=temperature)
         planners.model.save(tmp_path / "agent.zip")
         loaded = SAID.load(tmp_path / "agent.zip", device="cpu")
         assert loaded.policy.planner.config == planners.model.policy.planner.config
@@ -150,8 +150,8 @@ def test_an_agent_with_a_planner_put_in_is_saved_with_it(run, tmp_path):
 
 def test_planners_have_the_runs_settings_whatever_the_defaults_are_then(run, tmp_path, monkeypatch):
     expected = make(run, tmp_path / "before")
-    expected.put(1, 0.5)
-    expected.put(2, 0.5)
+    expected.put(1, temperature=0.5)
+    expected.put(2, temperature=0.5)
     defaults = list(PlannerConfig.__init__.__defaults__)
     names = [field.name for field in fields(PlannerConfig)]
     for name, value in {"embed_known": False, "solver": "dpmsolver++2m"}.items():
@@ -159,8 +159,8 @@ def test_planners_have_the_runs_settings_whatever_the_defaults_are_then(run, tmp
         defaults[names.index(name)] = value
     monkeypatch.setattr(PlannerConfig.__init__, "__defaults__", tuple(defaults))
     planners = make(run, tmp_path / "after")
-    planners.put(1, 0.5)  # the run's own
-    planners.put(2, 0.5)  # trained anew
+    planners.put(1, temperature=0.5)  # the run's own
+    planners.put(2, temperature=0.5)  # trained anew
     assert planners.config == expected.config
     assert planners.model.policy.planner.config == expected.model.policy.planner.config
     same_planner(planners, expected)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,17 +24,18 @@ class FreePlanners(DepthPlanners):
     """Planners that need no training; remembers which is in use."""
 
     def __init__(self) -> None:
-        self.cell = (0, 0.0)
+        self.tried: dict[str, Any] = {}
 
     def is_ready(self, depth: int) -> bool:
         return True
 
-    def put(self, depth: int, temperature: float) -> None:
-        self.cell = (depth, temperature)
+    def put(self, depth: int, **sampling: Any) -> None:
+        self.tried = {"depth": depth, **sampling}
 
 
-def make_search(folder: Path, temperatures: list[float], **options: Any) -> Search:
-    return Search(folder, str(folder / "study.log"), "test", [2], temperatures, **options)
+def make_search(folder: Path, temperatures: list[float], steps: Sequence[int] = (5,), **options: Any) -> Search:
+    tried = {"depth": [2], "temperature": temperatures, "sampling_steps": list(steps)}
+    return Search(folder, str(folder / "study.log"), "test", tried, **options)
 
 
 def test_a_hopeless_trial_is_pruned_and_a_close_one_is_not(tmp_path: Path) -> None:
@@ -41,8 +43,9 @@ def test_a_hopeless_trial_is_pruned_and_a_close_one_is_not(tmp_path: Path) -> No
     strength = {0.0: 100.0, 0.5: 0.0, 1.0: 99.0}
 
     def play(seed: int, n: int) -> list[float]:
-        noise = [np.random.default_rng((s, int(10 * planners.cell[1]))).normal(0, 20) for s in range(seed, seed + n)]
-        return [strength[planners.cell[1]] + x for x in noise]
+        temperature = planners.tried["temperature"]
+        noise = [np.random.default_rng((s, int(10 * temperature))).normal(0, 20) for s in range(seed, seed + n)]
+        return [strength[temperature] + x for x in noise]
 
     search = make_search(tmp_path, [0.0, 0.5, 1.0], episodes=20, round_size=5)
     assert search.work(planners, play) == 3
@@ -51,6 +54,17 @@ def test_a_hopeless_trial_is_pruned_and_a_close_one_is_not(tmp_path: Path) -> No
     assert states[0.0].state == states[1.0].state == TrialState.COMPLETE
     winner = search.winner()
     assert winner is not None and winner.params["temperature"] != 0.5 and len(returns_of(winner)) == 20
+
+
+def test_denoising_steps_are_tried_with_every_temperature(tmp_path: Path) -> None:
+    planners = FreePlanners()
+    for steps in ([1, 2], [2, 5]):  # a grid that grew makes only what is new
+        search = make_search(tmp_path, [0.0, 1.0], steps, episodes=1, prune=0.0)
+        search.work(planners, lambda s, n: [-abs(planners.tried["sampling_steps"] - 2.0)] * n)
+    cells = [(trial.params["temperature"], trial.params["sampling_steps"]) for trial in search.finished()]
+    assert sorted(cells) == [(0.0, 1), (0.0, 2), (0.0, 5), (1.0, 1), (1.0, 2), (1.0, 5)]
+    winner = search.winner()
+    assert winner is not None and winner.params == {"depth": 2, "temperature": 0.0, "sampling_steps": 2}
 
 
 def test_the_cell_of_a_dead_worker_is_tried_again(tmp_path: Path) -> None:
@@ -95,9 +109,11 @@ def test_tpe_tries_as_many_as_it_is_told(tmp_path: Path, storage: str) -> None:
     options: dict[str, Any] = {"sampler": "tpe", "n_trials": 9, "episodes": 2, "prune": 0.0}
     place = storage.format(tmp_path) if "://" in storage else str(tmp_path / storage)
     for expected in (9, 0):
-        search = Search(tmp_path, place, "test", [2, 4], [0.0, 1.0], **options)
-        assert search.work(planners, lambda s, n: [-abs(planners.cell[1] - 0.5)] * n) == expected
-    assert {trial.params["depth"] for trial in search.finished()} == {2, 4}
+        tried = {"depth": [2, 4], "temperature": [0.0, 1.0], "sampling_steps": [1, 5]}
+        search = Search(tmp_path, place, "test", tried, **options)
+        assert search.work(planners, lambda s, n: [-abs(planners.tried["temperature"] - 0.5)] * n) == expected
+    for name in ("depth", "sampling_steps"):
+        assert {trial.params[name] for trial in search.finished()} == set(tried[name])
     assert all(0.0 <= trial.params["temperature"] <= 1.0 for trial in search.finished())
 
 

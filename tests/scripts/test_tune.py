@@ -22,7 +22,7 @@ from trained_run import config_of, read_by_train, train_run, train_said
 from winner import RunConfig
 from zoo import read_delay
 
-from sb3_said import SAID
+from sb3_said import SAID, PlannerConfig
 from sb3_said.common.checkpoint import CHECKPOINT_NAME
 from sb3_said.common.save_util import load_tree
 from sb3_said.evaluation import rollout
@@ -50,7 +50,7 @@ def test_a_search_from_grid_to_report(
     run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("matplotlib")
-    command = ["--run", str(run), "--depths", "1", "2", "--temperatures", "0", "1", *QUICK]
+    command = ["--run", str(run), "--depths", "1", "2", "--temperatures", "0", "1", "--sampling-steps", "2", *QUICK]
     seeds: list[int] = []
 
     def recorded(model: Any, env: Any, n: int, seed: int, *args: Any, **kwargs: Any) -> Any:
@@ -76,6 +76,7 @@ def test_a_search_from_grid_to_report(
     winner = results["winner"]
     config = best.model.policy.planner.config
     assert (config.depth, config.temperature) == (winner["depth"], winner["temperature"])
+    assert config.sampling_steps == winner["sampling_steps"] == 2 != PlannerConfig().sampling_steps
     for one in report["results"]:
         with best.model.policy.answering(one["label"]):
             played = rollout(best.model, best.make_env, 3, report["seed"], n_envs=8)
@@ -92,7 +93,7 @@ def test_a_search_from_grid_to_report(
 
     # A grid that grew makes only what is new.
     monkeypatch.setattr(tune, "rollout", rollout)
-    tune.main(["--run", str(run), "--depths", "1", "--temperatures", "0", "0.5", "1", *QUICK])
+    tune.main(["--run", str(run), "--depths", "1", "--temperatures", "0", "0.5", "1", "--sampling-steps", "2", *QUICK])
     trials = json.loads((run / "tune" / "results.json").read_text())["trials"]
     assert [(t["depth"], t["temperature"]) for t in trials[4:]] == [(1, 0.5)]
 
@@ -127,7 +128,8 @@ def test_a_search_with_a_drawn_delay_or_vec_normalize(delay: list[int], params: 
             played = rollout(best.model, best.make_env, 3, report["seed"], n_envs=8, normalize=best.normalize)
         assert one["returns"] == played.returns.tolist()
     expected = {**config_of(run), "n_timesteps": 200}
-    expected["planner_kwargs"] |= {name: results["winner"][name] for name in ("depth", "temperature")}
+    tried = ("depth", "temperature", "sampling_steps")
+    expected["planner_kwargs"] |= {name: results["winner"][name] for name in tried}
     assert read_by_train(run / "tune" / "best.yml", read_delay([str(d) for d in delay]), "cpu", tmp_path) == expected
     command = RunConfig.read(run).train_command(run / "tune")
     assert f"--delay {' '.join(map(str, delay))} -conf" in command
@@ -159,6 +161,8 @@ def test_two_workers_share_a_study_and_train_no_depth_twice(run: Path, storage: 
         (["--prune", "1.5"], "--prune is a p-value"),
         (["--depths", "2", "2"], "--depths names a value twice: 2 2"),
         (["--temperatures", "-1"], "temperature is -1"),
+        (["--sampling-steps", "0"], "sampling_steps is 0"),
+        (["--sampling-steps", "2", "2"], "--sampling-steps names a value twice: 2 2"),
         (["--depths", "0"], "depth is 0"),
     ],
 )
