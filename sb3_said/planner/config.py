@@ -13,7 +13,15 @@ SCORED_STATES = ("future", "decision", "all")
 LR_SCHEDULES = ("cosine", "constant")
 VALUE_SCALES = ("rank", "range")
 #: Settings that shape a planner's answers and none of its weights.
-SAMPLING_SETTINGS = ("solver", "time_grid", "sampling_steps", "n_candidates", "temperature", "scored_states")
+SAMPLING_SETTINGS = (
+    "solver",
+    "time_grid",
+    "sampling_steps",
+    "n_candidates",
+    "temperature",
+    "scored_states",
+    "choice_factor",
+)
 
 
 @dataclass(frozen=True)
@@ -58,6 +66,9 @@ class PlannerConfig:
     # "future": states after the decision index (measured); "decision": the decision alone, at the present that the
     # candidates agree on, so that only actions compete and not beliefs; "all": all states but the first (paper)
     scored_states: str = "future"
+    # None: the candidate of the highest value decides (paper). A number beta >= 0: the candidates' mean decides, weighed
+    # by exp(beta * z), z a candidate's value in standard deviations of all; 1 is better at long delays (docs/said.md)
+    choice_factor: float | None = None
     # Training
     learning_rate: float = 2e-3  # measured at depth 2, together with the warm-up
     lr_schedule: str = "cosine"  # paper: down to 0; or "constant"
@@ -98,6 +109,10 @@ class PlannerConfig:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected at least {smallest}.")
         if self.d_model < dit.HEAD_DIM or self.d_model % dit.HEAD_DIM:
             raise ValueError(f"d_model is {self.d_model}, expected a multiple of {dit.HEAD_DIM}.")
+        if self.choice_factor is not None and not self.choice_factor >= 0:
+            raise ValueError(
+                f"choice_factor is {self.choice_factor}, expected at least 0, or None for the best candidate."
+            )
         if not self.learning_rate > 0 or not (self.gradient_clip is None or self.gradient_clip > 0):
             raise ValueError(
                 f"learning_rate is {self.learning_rate} and gradient_clip {self.gradient_clip}, expected positive "

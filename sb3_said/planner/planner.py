@@ -24,11 +24,11 @@ ValueFn = Callable[[th.Tensor, th.Tensor], th.Tensor]
 class Plan(NamedTuple):
     """Candidate plans for B decisions, in environment units."""
 
-    action: th.Tensor  # (B, act_dim), in [-1, 1]: the best candidate's action at the decision index
+    action: th.Tensor  # (B, act_dim), in [-1, 1]: the best candidate's action at the decision index, or their mean
     present: th.Tensor  # (B, obs_dim): s_t as the candidates decode it, their mean
     states: th.Tensor  # (B, N, L, obs_dim), L the largest delay of the decisions plus the horizon
     actions: th.Tensor  # (B, N, L, act_dim), in [-1, 1]
-    values: th.Tensor  # (B, N), the scores the best was chosen by
+    values: th.Tensor  # (B, N), the scores they were chosen or weighed by
 
 
 class InpaintingPlanner(nn.Module):
@@ -174,6 +174,8 @@ class InpaintingPlanner(nn.Module):
     ) -> Plan:
         """Inpaint N candidate windows per decision and choose the one of the highest mean value (MCSS).
 
+        With ``config.choice_factor`` the decision is the candidates' mean instead, weighed by their values.
+
         The arguments that default to ``None`` take the config's value. One candidate is enough, and drawn, where the
         others could not matter: at temperature 0, where all are alike, and by default without a ``value_fn``.
 
@@ -293,7 +295,9 @@ class InpaintingPlanner(nn.Module):
         rows = th.arange(len(x), device=x.device)
         present = states[rows, :, delay].mean(1)  # (B, obs_dim)
         values = self._values(states, actions, present, delay, value_fn, shortest)  # (B, N)
-        return Plan(actions[rows, values.argmax(1), delay], present, states, actions, values)
+        return Plan(
+            choose(actions[rows, :, delay], values, self.config.choice_factor), present, states, actions, values
+        )
 
     def _values(
         self,
@@ -379,6 +383,22 @@ class InpaintingPlanner(nn.Module):
         if not ((state_known == 0) | (state_known == 1)).all():
             raise ValueError("state_known has entries other than 0 and 1, expected 1 where a state is known.")
         return state_history, state_known.bool()
+
+
+def choose(actions: th.Tensor, values: th.Tensor, factor: float | None) -> th.Tensor:
+    """Return one action of N: the most valuable, or the mean weighed by exp(factor * z), z the standardised values.
+
+    Where the present is uncertain the most valuable of many is mostly a lucky one, and acting on luck is jittery.
+
+    :param actions: (B, N, act_dim)
+    :param values: (B, N)
+    :param factor: None for the most valuable
+    :return: (B, act_dim)
+    """
+    if factor is None:
+        return actions[th.arange(len(actions), device=actions.device), values.argmax(1)]
+    z = (values - values.mean(1, keepdim=True)) / values.std(1, correction=0, keepdim=True).clamp(min=1e-6)
+    return ((factor * z).softmax(1)[..., None] * actions).sum(1)
 
 
 def _owner(value_fn: ValueFn) -> object:

@@ -16,6 +16,7 @@ from sb3_said.common.windows import Windows
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner.diffusion import alpha_sigma, draw_times
 from sb3_said.planner.normalizer import Normalizer
+from sb3_said.planner.planner import choose
 
 OBS, ACT, DELAY = 3, 2, 4
 SMALL = PlannerConfig(
@@ -112,6 +113,7 @@ def test_config_survives_json():
         ({"lr_schedule": "step"}, "lr_schedule is 'step'"),
         ({"horizon": 1}, "horizon is 1, expected at least 2"),
         ({"depth": 0}, "depth is 0, expected at least 1"),
+        ({"choice_factor": -1.0}, "choice_factor is -1.0, expected at least 0"),
         ({"temperature": float("nan")}, "temperature is nan, expected at least 0"),
         ({"d_model": 100}, "d_model is 100, expected a multiple of 32"),
         ({"learning_rate": 0.0}, "learning_rate is 0.0"),
@@ -399,6 +401,33 @@ def test_selection_scores_the_right_states_and_takes_the_best(scored_states):
         best.append(int(th.stack(scores).argmax()))
         assert th.equal(plan.action[b], plan.actions[b, best[-1], d])
     assert len(set(best)) > 2  # otherwise the first could have been taken every time
+
+
+@pytest.mark.parametrize("factor", [0.0, 0.7, 3.0])
+def test_candidates_can_be_averaged_by_their_values(factor):
+    planner, batch = make_planner(choice_factor=factor), make_batch(6)
+    plan = planner.plan(*batch, value_fn=lambda s, a: s.sum(-1) + a[..., 0], generator=seeded())
+    for b, d in enumerate(batch[2].tolist()):
+        values, actions = plan.values[b].double().numpy(), plan.actions[b, :, d].double().numpy()
+        weights = np.exp(factor * (values - values.mean()) / values.std())
+        np.testing.assert_allclose(plan.action[b], np.average(actions, axis=0, weights=weights), rtol=1e-4, atol=1e-6)
+
+
+@given(st.floats(0.01, 100), st.floats(-1000, 1000))
+def test_weights_do_not_depend_on_the_scale_of_values(scale, shift):
+    actions, values = th.rand(3, 8, 2, generator=seeded()), th.randn(3, 8, generator=seeded(1))
+    scaled = (scale * values.double() + shift).float()
+    th.testing.assert_close(choose(actions, scaled, 1.0), choose(actions, values, 1.0), rtol=1e-2, atol=1e-2)
+
+
+def test_an_average_lies_between_no_choice_and_the_best():
+    actions, values = th.rand(3, 8, 2, generator=seeded()), th.randn(3, 8, generator=seeded(1))
+    rows, best = th.arange(3), values.argmax(1)
+    assert th.equal(choose(actions, values, None), actions[rows, best])
+    th.testing.assert_close(choose(actions, values, 1e4), actions[rows, best])
+    th.testing.assert_close(choose(actions, values, 0.0), actions.mean(1))
+    th.testing.assert_close(choose(actions, th.ones(3, 8), 1.0), actions.mean(1))  # nothing to tell them apart by
+    th.testing.assert_close(choose(actions[:, :1], values[:, :1], 1.0), actions[:, 0])
 
 
 def test_value_function_must_give_one_number_per_state():

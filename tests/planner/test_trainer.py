@@ -147,6 +147,7 @@ OTHER_SETTINGS = {
     "n_candidates": 3,
     "temperature": 0.5,
     "scored_states": "all",
+    "choice_factor": 1.0,
     "learning_rate": 3e-3,
     "lr_schedule": "constant",
     "warmup_steps": 2,
