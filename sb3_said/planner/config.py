@@ -66,7 +66,7 @@ class PlannerConfig:
     # "future": states after the decision index (measured); "decision": the decision alone, at the present that the
     # candidates agree on, so that only actions compete and not beliefs; "all": all states but the first (paper)
     scored_states: str = "future"
-    # None: the candidate of the highest value decides (paper). A number beta >= 0: the candidates' mean decides, weighed
+    # None: the candidate of the highest value decides (paper). A number beta >= 0: the candidates' mean does, weighed
     # by exp(beta * z), z a candidate's value in standard deviations of all; 1 is better at long delays (docs/said.md)
     choice_factor: float | None = None
     # Training
