@@ -1,7 +1,6 @@
-"""The planner: configuration, normaliser, loss, plans, selection, refusals."""
+"""The planner: loss, plans, selection, refusals."""
 
 import dataclasses
-import json
 import math
 
 import numpy as np
@@ -9,181 +8,27 @@ import pytest
 import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
+from small_planner import (
+    ACT,
+    DELAY,
+    LENGTH,
+    OBS,
+    SMALL,
+    FakeNetwork,
+    existing,
+    good,
+    make_batch,
+    make_planner,
+    make_windows,
+    seeded,
+)
 from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_said.common import precision
 from sb3_said.common.windows import Windows
-from sb3_said.planner import InpaintingPlanner, PlannerConfig
+from sb3_said.planner import InpaintingPlanner
 from sb3_said.planner.diffusion import alpha_sigma, draw_times
-from sb3_said.planner.normalizer import Normalizer
 from sb3_said.planner.planner import choose
-
-OBS, ACT, DELAY = 3, 2, 4
-SMALL = PlannerConfig(
-    depth=2, d_model=32, horizon=4, precision="float32", sampling_steps=3, n_candidates=5, temperature=0.5
-)
-LENGTH = DELAY + SMALL.horizon
-
-
-def make_planner(max_delay=DELAY, **changes):
-    """A planner whose weights and statistics are random, so that every input shows in the output."""
-    planner = InpaintingPlanner(OBS, ACT, max_delay, dataclasses.replace(SMALL, **changes))
-    generator = th.Generator().manual_seed(1)
-    for parameter in planner.parameters():
-        th.nn.init.normal_(parameter, std=0.2, generator=generator)
-    states = th.tensor([10.0, 0.0, -3.0]) + th.tensor([4.0, 0.1, 1.0]) * th.randn(100, OBS, generator=generator)
-    planner.fit_normalizer(states, th.rand(100, ACT, generator=generator) * 2 - 1)
-    return planner
-
-
-def make_batch(n, max_delay=DELAY, seed=0):
-    generator = th.Generator().manual_seed(seed)
-    observation = 5 * th.randn(n, OBS, generator=generator)
-    history = th.rand(n, max_delay, ACT, generator=generator) * 2 - 1
-    return observation, history, th.randint(max_delay + 1, (n,), generator=generator)
-
-
-def make_windows(n=6, seed=0):
-    generator = th.Generator().manual_seed(seed)
-    valid = th.arange(LENGTH) < th.randint(1, LENGTH + 1, (n, 1), generator=generator)
-    states = 5 * th.randn(n, LENGTH, OBS, generator=generator)
-    actions = th.rand(n, LENGTH, ACT, generator=generator) * 2 - 1
-    return Windows(states, actions, valid, th.rand(n, generator=generator))
-
-
-def existing(windows, delay):
-    """Steps that are in the episode and within the horizon of their delay: (n, L) bool."""
-    return windows.valid & (th.arange(LENGTH) < delay[:, None] + SMALL.horizon)
-
-
-def seeded(seed=0):
-    return th.Generator().manual_seed(seed)
-
-
-class FakeNetwork(th.nn.Module):
-    """Answers with a stored tensor and remembers what it was shown."""
-
-    def __init__(self, output):
-        super().__init__()
-        self.output = output
-
-    def context(self, window, known):
-        self.known = known
-
-    def modulations(self, t):
-        self.t = t
-
-    def forward(self, x, context, modulations, valid):
-        self.x, self.valid = x, valid
-        return self.output
-
-
-# --- configuration ---------------------------------------------------------------------------------------------------
-
-
-def test_paper_config_is_the_papers_table():
-    config = PlannerConfig.paper(depth=4, temperature=0.3)
-    expected = {"depth": 4, "d_model": 256, "horizon": 8, "prediction": "epsilon", "schedule": "linear"}
-    expected |= {"solver": "ddim", "sampling_steps": 20, "n_candidates": 50, "temperature": 0.3, "mask": "fixed"}
-    expected |= {"action_transform": "tanh", "scored_states": "all", "batch_size": 256, "learning_rate": 2e-4}
-    expected |= {"ema_decay": 0.9999, "weight_factor": 2.0, "warmup_steps": 0, "gradient_clip": None}
-    expected |= {"value_scale": "range", "end_time_probability": 0.0}
-    assert expected.items() <= dataclasses.asdict(config).items()
-    assert PlannerConfig.paper(sampling_steps=2).sampling_steps == 2
-
-
-def test_config_survives_json():
-    config = PlannerConfig(betas=(0.8, 0.99))
-    assert PlannerConfig(**json.loads(json.dumps(dataclasses.asdict(config)))) == config
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"prediction": "score"}, r"prediction is 'score', expected one of \('v', 'epsilon', 'x0'\)"),
-        ({"positions": "rotary"}, "positions is 'rotary'"),
-        ({"schedule": "sqrt"}, "schedule is 'sqrt'"),
-        ({"time_sampling": "beta"}, "time_sampling is 'beta'"),
-        ({"mask": "block"}, "mask is 'block'"),
-        ({"action_transform": "log"}, "action_transform is 'log'"),
-        ({"solver": "euler"}, "solver is 'euler'"),
-        ({"time_grid": "karras"}, "time_grid is 'karras'"),
-        ({"scored_states": "past"}, "scored_states is 'past'"),
-        ({"precision": "half"}, "precision is 'half'"),
-        ({"lr_schedule": "step"}, "lr_schedule is 'step'"),
-        ({"horizon": 1}, "horizon is 1, expected at least 2"),
-        ({"depth": 0}, "depth is 0, expected at least 1"),
-        ({"choice_factor": -1.0}, "choice_factor is -1.0, expected at least 0"),
-        ({"temperature": float("nan")}, "temperature is nan, expected at least 0"),
-        ({"d_model": 100}, "d_model is 100, expected a multiple of 32"),
-        ({"learning_rate": 0.0}, "learning_rate is 0.0"),
-        ({"gradient_clip": 0.0}, "give gradient_clip=None"),
-        ({"extra_state_probability": 1.1}, r"extra_state_probability is 1.1, expected a number in \[0, 1\]"),
-        ({"ema_decay": 1.5}, r"ema_decay is 1.5, expected a number in \[0, 1\]"),
-    ],
-)
-def test_config_refuses(changes, message):
-    with pytest.raises(ValueError, match=message):
-        PlannerConfig(**changes)
-
-
-# --- normaliser ------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("transform", ["standard", "tanh"])
-def test_normalised_data_has_mean_0_and_deviation_1(transform):
-    normalizer = Normalizer(3, 1, 4, transform)
-    states = th.randn(1000, 3, generator=seeded()) * th.tensor([3.0, 1e-7, 0.0]) + th.tensor([50.0, 0.0, 1.2345])
-    actions = (2 * th.randn(1000, 1, generator=seeded(1))).tanh()
-    normalizer.fit(states, actions)
-    normal = normalizer.normalize_states(states)
-    th.testing.assert_close(normal.mean(0), th.zeros(3), atol=1e-4, rtol=0.0)
-    th.testing.assert_close(normal.std(0, correction=0), th.tensor([1.0, 1.0, 0.0]), atol=1e-4, rtol=0.0)
-    normal = normalizer.normalize_actions(actions)
-    assert normal.mean().item() == pytest.approx(0, abs=1e-4)
-    assert normal.std(correction=0).item() == pytest.approx(1, abs=1e-4)
-    th.testing.assert_close(normalizer.denormalize_states(normalizer.normalize_states(states)), states)
-
-
-@pytest.mark.parametrize("transform", ["standard", "tanh"])
-@given(action=st.floats(-1, 1), prediction=st.floats(-1e3, 1e3), mean=st.floats(-1, 1), std=st.floats(0.1, 3))
-def test_actions_return_from_the_transform_within_bounds(transform, action, prediction, mean, std):
-    normalizer = Normalizer(1, 1, 4, transform)
-    normalizer.action_mean.fill_(mean)
-    normalizer.action_std.fill_(std)
-    action = th.tensor([action])
-    back = normalizer.denormalize_actions(normalizer.normalize_actions(action))
-    expected = action if transform == "standard" else action.clamp(-0.999, 0.999)
-    th.testing.assert_close(back, expected, atol=1e-5, rtol=1e-5)
-    assert -1 <= normalizer.denormalize_actions(th.tensor([prediction])).item() <= 1
-
-
-def test_moves_are_scaled_index_by_index_over_valid_steps():
-    planner, windows = make_planner(relative_states=True), make_windows(40)
-    normalizer = planner.normalizer
-    normalizer.fit_moves(windows)
-    z = normalizer.normalize_states(windows.states)
-    for k in range(1, LENGTH):
-        moves = z[windows.valid[:, k], k] - z[windows.valid[:, k], 0]
-        th.testing.assert_close(normalizer.move_std[k - 1], moves.square().mean(0).sqrt())
-
-
-@pytest.mark.parametrize("relative", [True, False])
-@pytest.mark.parametrize("transform", ["standard", "tanh"])
-def test_windows_return_from_the_planners_units(relative, transform):
-    planner, windows = make_planner(relative_states=relative, action_transform=transform), make_windows()
-    planner.normalizer.fit_moves(windows)
-    states, actions = planner.normalizer.denormalize(planner.normalizer.normalize(windows.states, windows.actions))
-    th.testing.assert_close(states, windows.states, atol=1e-4, rtol=1e-4)
-    th.testing.assert_close(actions, windows.actions.clamp(-0.999, 0.999), atol=2e-3, rtol=0.0)
-
-
-def test_steps_that_never_move_are_not_blown_up():
-    planner = make_planner(relative_states=True)
-    still = th.ones(8, LENGTH, OBS), th.zeros(8, LENGTH, ACT), th.ones(8, LENGTH, dtype=th.bool), th.ones(8)
-    planner.normalizer.fit_moves(Windows(*still))
-    assert th.equal(planner.normalizer.move_std, th.ones(LENGTH - 1, OBS))
-
 
 # --- loss ------------------------------------------------------------------------------------------------------------
 
@@ -430,6 +275,25 @@ def test_an_average_lies_between_no_choice_and_the_best():
     th.testing.assert_close(choose(actions[:, :1], values[:, :1], 1.0), actions[:, 0])
 
 
+def test_the_decision_alone_is_scored_at_the_present_that_all_candidates_share():
+    planner = make_planner(scored_states="decision", n_candidates=5)
+    observation, history, delay = make_batch(6)
+    seen = []
+
+    def value_fn(states, actions):
+        seen.append((states, actions))
+        return states.sum(-1) + actions[..., 0]
+
+    plan = planner.plan(observation, history, delay, value_fn=value_fn, generator=seeded())
+    (states, actions), rows = seen[0], th.arange(6)
+    present, decisions = plan.states[rows, :, delay].mean(1), plan.actions[rows, :, delay]  # (6, OBS), (6, 5, ACT)
+    th.testing.assert_close(plan.present, present)
+    th.testing.assert_close(states, present[:, None, None].expand(6, 5, 1, OBS))
+    th.testing.assert_close(actions, decisions[:, :, None])
+    best = decisions[..., 0].argmax(1)  # the present is the same for all, so the actions decide
+    assert th.equal(plan.action, decisions[rows, best]) and len(set(best.tolist())) > 1
+
+
 def test_value_function_must_give_one_number_per_state():
     planner, batch = make_planner(), make_batch(2)
     with pytest.raises(ValueError, match="drop a last dimension of 1"):
@@ -543,160 +407,7 @@ def test_training_learns_to_decode_the_present():
         assert error <= 0.15 * test.states.std().item()
 
 
-# --- extra known states ----------------------------------------------------------------------------------------------
-
-
-def make_extra(n, max_delay=DELAY, seed=7):
-    generator = th.Generator().manual_seed(seed)
-    states = 5 * th.randn(n, max_delay, OBS, generator=generator)
-    return {"state_history": states, "state_known": th.rand(n, max_delay, generator=generator) < 0.5}
-
-
-def test_without_extra_states_everything_is_as_it_was_before_there_were_any():
-    """Recorded with the planner as it was then, on a CPU."""
-    th.manual_seed(3)
-    planner = InpaintingPlanner(OBS, ACT, DELAY, dataclasses.replace(SMALL, end_time_probability=0.0))
-    assert sum(p.numel() for p in planner.parameters()) == 44_037
-    assert sum(p.double().abs().sum() for p in planner.parameters()).item() == pytest.approx(3163.8683, rel=1e-5)
-    generator = seeded(1)
-    for parameter in planner.parameters():
-        th.nn.init.normal_(parameter, std=0.2, generator=generator)
-    states, actions = th.randn(6, 8, 3, generator=generator), th.rand(6, 8, 2, generator=generator) * 2 - 1
-    windows = Windows(states, actions, th.ones(6, 8, dtype=th.bool), th.ones(6))
-    assert planner.loss(windows, generator=generator).item() == pytest.approx(2.797025, rel=1e-5)
-    delay = th.tensor([0, 1, 2, 3, 4, 4])
-    plan = planner.plan(states[:, 0], actions[:, :4], delay, n_candidates=3, generator=generator)
-    assert plan.states.sum().item() == pytest.approx(-205.37096, rel=1e-4)
-    assert th.rand(1, generator=generator).item() == pytest.approx(0.28567809)  # as many draws as then
-
-
-@pytest.mark.parametrize("relative", [True, False])
-@pytest.mark.parametrize("embed_known", [True, False])
-@pytest.mark.parametrize("max_delay", [0, DELAY])
-def test_extra_states_come_back_exactly_in_every_candidate(max_delay, embed_known, relative):
-    changes = {"relative_states": relative, "embed_known": embed_known}
-    planner = make_planner(max_delay, extra_state_probability=0.5, **changes)
-    delay = th.arange(max_delay + 1).repeat(4)
-    observation, history, _ = make_batch(len(delay), max_delay)
-    extra = make_extra(len(delay), max_delay)
-    if max_delay > 0:
-        extra["state_known"][-1] = True
-    plan = planner.plan(observation, history, delay, n_candidates=3, **extra)
-    exact = 0
-    for b, d in enumerate(delay.tolist()):
-        assert (plan.states[b, :, 0] == observation[b]).all()
-        for k in range(max_delay - d, max_delay):
-            given = (plan.states[b, :, k + 1 - (max_delay - d)] == extra["state_history"][b, k]).all()
-            assert given == extra["state_known"][b, k]
-            exact += int(given)
-    if max_delay > 0:
-        assert exact > 5
-        assert (plan.states[-1, :, DELAY] == extra["state_history"][-1, -1]).all()  # s_t is known: the present is s_t
-
-
-def test_every_network_call_sees_extra_states_clean_and_is_told():
-    planner = make_planner(extra_state_probability=0.5, relative_states=True)
-    planner.normalizer.move_std.uniform_(0.5, 2.0, generator=seeded(5))
-    observation, history, _ = make_batch(4)
-    delay, extra, seen = th.full((4,), DELAY), make_extra(4), []
-    known = th.cat([th.ones(4, 1, dtype=th.bool), extra["state_known"]], 1)  # (4, D + 1), of indices 0..D
-    states = th.cat([observation[:, None], extra["state_history"]], 1)
-    normalizer = planner.normalizer
-    moves = (states[:, 1:] - states[:, :1]) / normalizer.state_std / normalizer.move_std[:DELAY]
-    clean = th.cat([normalizer.normalize_states(observation)[:, None], moves], 1)
-    planner.network.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
-
-    def plan(state_history):
-        given = {**extra, "state_history": state_history}
-        return planner.plan(observation, history, delay, n_candidates=3, generator=seeded(), **given)
-
-    base = plan(extra["state_history"])
-    assert len(seen) == SMALL.sampling_steps
-    for x in seen:
-        shown = x.unflatten(0, (4, 3))[:, :, : DELAY + 1, :OBS]
-        th.testing.assert_close(
-            shown[known[:, None].expand(-1, 3, -1)], clean[:, None].expand_as(shown)[known[:, None].expand(-1, 3, -1)]
-        )
-    # What is not known has no influence; what is known has one on all that is not, and so has knowing it
-    again = plan(extra["state_history"] + ~extra["state_known"][..., None])
-    assert th.equal(again.states, base.states)
-    again = plan(extra["state_history"] + extra["state_known"][..., None])
-    assert (again.states[:, :, DELAY + 1 :] != base.states[:, :, DELAY + 1 :]).all(-1).all()
-
-
-def test_states_before_the_window_are_dropped():
-    planner = make_planner(extra_state_probability=0.5, temperature=0.0)
-    observation, history, _ = make_batch(1)
-    everything, states = th.ones(1, DELAY), make_extra(1)["state_history"]
-    for d in range(DELAY + 1):
-        delay, plans = th.tensor([d]), []
-        for k in (None, *range(DELAY)):
-            changed = states.clone()
-            if k is not None:
-                changed[0, k] += 1.0
-            plan = planner.plan(observation, history, delay, state_history=changed, state_known=everything)
-            plans.append(plan.states)
-        assert [th.equal(plan, plans[0]) for plan in plans[1:]] == [k < DELAY - d for k in range(DELAY)]
-        if d == 0:
-            assert th.equal(plans[0], planner.plan(observation, history, delay).states)
-
-
-def test_no_extra_states_given_are_none_known():
-    planner, batch = make_planner(extra_state_probability=0.5), make_batch(5)
-    extra = make_extra(5)
-    none = planner.plan(*batch, n_candidates=2, generator=seeded())
-    unknown = {**extra, "state_known": th.zeros(5, DELAY)}
-    assert th.equal(planner.plan(*batch, n_candidates=2, generator=seeded(), **unknown).states, none.states)
-    some = planner.plan(*batch, n_candidates=2, generator=seeded(), **extra)
-    assert not th.equal(some.states, none.states)
-
-
-def test_extra_states_of_one_decision_do_not_disturb_another():
-    planner, noise = make_planner(extra_state_probability=0.5), th.randn(3, LENGTH, OBS + ACT)
-    batch, extra = make_batch(6), make_extra(6)
-    together = planner.plan(*batch, noise=noise, **extra)
-    for b in range(6):
-        row = slice(b, b + 1)
-        alone = planner.plan(*(x[row] for x in batch), noise=noise, **{key: x[row] for key, x in extra.items()})
-        length = alone.states.shape[2]
-        th.testing.assert_close(alone.states[0], together.states[b, :, :length], atol=1e-4, rtol=1e-4)
-
-
-def test_loss_shows_drawn_states_clean_and_learns_the_others():
-    planner, windows = make_planner(extra_state_probability=0.7), make_windows(400)
-    delay = th.arange(400) % (DELAY + 1)
-    planner.network = network = FakeNetwork(th.randn(400, LENGTH, OBS + ACT, requires_grad=True))
-    planner.loss(windows, delay, generator=seeded()).backward()
-    exists = existing(windows, delay)
-    assert th.equal(network.output.grad != 0, exists[..., None] & ~network.known)
-    clean = planner.normalizer.normalize(windows.states, windows.actions)
-    assert th.equal(network.x[network.known], clean[network.known])
-    shown = network.known[..., 0]  # (n, L)
-    assert (network.known[..., :OBS] == shown[..., None]).all() and shown[:, 0].all()
-    inside = exists & (th.arange(LENGTH) >= 1) & (th.arange(LENGTH) <= delay[:, None])
-    assert not shown[:, 1:][~inside[:, 1:]].any()  # nothing behind the present, and nothing at all of d = 0
-    # Each with probability 0.7 / 2; the numbers known of a window are spread much wider than a fixed share's
-    assert shown[inside].float().mean().item() == pytest.approx(0.35, abs=0.06)
-    full = inside.sum(1) == DELAY
-    assert {0, DELAY} < set(shown[full][:, 1 : DELAY + 1].sum(1).tolist())
-    assert (network.known[..., OBS:] == (exists & (th.arange(LENGTH) < delay[:, None]))[..., None]).all()
-
-
-def test_state_dict_carries_what_extra_states_need():
-    planner, batch, extra = make_planner(extra_state_probability=0.5), make_batch(3), make_extra(3)
-    other = InpaintingPlanner(OBS, ACT, DELAY, planner.config)
-    other.load_state_dict(planner.state_dict())
-    assert th.equal(*(p.plan(*batch, generator=seeded(), **extra).states for p in (planner, other)))
-    with pytest.raises(RuntimeError, match="size mismatch"):
-        make_planner().load_state_dict(planner.state_dict())
-
-
 # --- refusals --------------------------------------------------------------------------------------------------------
-
-
-def good():
-    observation, history, delay = make_batch(2)
-    return {"observation": observation, "action_history": history, "delay": delay}
 
 
 @pytest.mark.parametrize(
@@ -726,31 +437,6 @@ def test_plan_refuses_before_it_computes(changes, message):
         planner.plan(**(good() | changes))
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"state_history": None}, "Only one of state_history and state_known is given; give both or neither"),
-        ({"state_known": None}, "Only one of state_history and state_known is given; give both or neither"),
-        ({"state_history": th.zeros(2, 3, 3)}, r"state_history has the shape \(2, 3, 3\), expected \(2, 4, 3\)"),
-        ({"state_history": th.full((2, 4, 3), th.nan)}, "state_history has entries that are NaN or infinite"),
-        ({"state_known": th.zeros(2, 4, 1)}, r"state_known has the shape \(2, 4, 1\), expected \(2, 4\)"),
-        ({"state_known": th.full((2, 4), 0.5)}, "state_known has entries other than 0 and 1"),
-        ({"state_known": th.full((2, 4), th.nan)}, "state_known has entries that are NaN"),
-    ],
-)
-def test_plan_refuses_bad_extra_states(changes, message):
-    planner = make_planner(extra_state_probability=0.5)
-    planner.network = None  # nothing may be computed
-    with pytest.raises(ValueError, match=message):
-        planner.plan(**(good() | make_extra(2) | changes))
-
-
-def test_a_planner_trained_without_extra_states_refuses_them():
-    planner = make_planner()
-    with pytest.raises(ValueError, match=r"not trained with extra known states; .*extra_state_probability=0.5"):
-        planner.plan(**good(), **make_extra(2))
-
-
 def test_loss_and_normaliser_refuse():
     planner, windows = make_planner(), make_windows()
     with pytest.raises(ValueError, match=r"windows.states has the shape \(6, 5, 3\), expected \(any, 8, 3\)"):
@@ -767,22 +453,3 @@ def test_loss_and_normaliser_refuse():
         planner.fit_normalizer(th.zeros(4, OBS), th.zeros(5, ACT))
     with pytest.raises(ValueError, match="obs_dim, act_dim and max_delay are 3, 0 and -1"):
         InpaintingPlanner(3, 0, -1)
-
-
-def test_the_decision_alone_is_scored_at_the_present_that_all_candidates_share():
-    planner = make_planner(scored_states="decision", n_candidates=5)
-    observation, history, delay = make_batch(6)
-    seen = []
-
-    def value_fn(states, actions):
-        seen.append((states, actions))
-        return states.sum(-1) + actions[..., 0]
-
-    plan = planner.plan(observation, history, delay, value_fn=value_fn, generator=seeded())
-    (states, actions), rows = seen[0], th.arange(6)
-    present, decisions = plan.states[rows, :, delay].mean(1), plan.actions[rows, :, delay]  # (6, OBS), (6, 5, ACT)
-    th.testing.assert_close(plan.present, present)
-    th.testing.assert_close(states, present[:, None, None].expand(6, 5, 1, OBS))
-    th.testing.assert_close(actions, decisions[:, :, None])
-    best = decisions[..., 0].argmax(1)  # the present is the same for all, so the actions decide
-    assert th.equal(plan.action, decisions[rows, best]) and len(set(best.tolist())) > 1

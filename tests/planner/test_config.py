@@ -1,0 +1,54 @@
+"""The settings: the paper's, those of a file, and those that are refused."""
+
+import dataclasses
+import json
+
+import pytest
+
+from sb3_said.planner import PlannerConfig
+
+
+def test_paper_config_is_the_papers_table():
+    config = PlannerConfig.paper(depth=4, temperature=0.3)
+    expected = {"depth": 4, "d_model": 256, "horizon": 8, "prediction": "epsilon", "schedule": "linear"}
+    expected |= {"solver": "ddim", "sampling_steps": 20, "n_candidates": 50, "temperature": 0.3, "mask": "fixed"}
+    expected |= {"action_transform": "tanh", "scored_states": "all", "batch_size": 256, "learning_rate": 2e-4}
+    expected |= {"ema_decay": 0.9999, "weight_factor": 2.0, "warmup_steps": 0, "gradient_clip": None}
+    expected |= {"value_scale": "range", "end_time_probability": 0.0}
+    assert expected.items() <= dataclasses.asdict(config).items()
+    assert PlannerConfig.paper(sampling_steps=2).sampling_steps == 2
+
+
+def test_config_survives_json():
+    config = PlannerConfig(betas=(0.8, 0.99))
+    assert PlannerConfig(**json.loads(json.dumps(dataclasses.asdict(config)))) == config
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"prediction": "score"}, r"prediction is 'score', expected one of \('v', 'epsilon', 'x0'\)"),
+        ({"positions": "rotary"}, "positions is 'rotary'"),
+        ({"schedule": "sqrt"}, "schedule is 'sqrt'"),
+        ({"time_sampling": "beta"}, "time_sampling is 'beta'"),
+        ({"mask": "block"}, "mask is 'block'"),
+        ({"action_transform": "log"}, "action_transform is 'log'"),
+        ({"solver": "euler"}, "solver is 'euler'"),
+        ({"time_grid": "karras"}, "time_grid is 'karras'"),
+        ({"scored_states": "past"}, "scored_states is 'past'"),
+        ({"precision": "half"}, "precision is 'half'"),
+        ({"lr_schedule": "step"}, "lr_schedule is 'step'"),
+        ({"horizon": 1}, "horizon is 1, expected at least 2"),
+        ({"depth": 0}, "depth is 0, expected at least 1"),
+        ({"choice_factor": -1.0}, "choice_factor is -1.0, expected at least 0"),
+        ({"temperature": float("nan")}, "temperature is nan, expected at least 0"),
+        ({"d_model": 100}, "d_model is 100, expected a multiple of 32"),
+        ({"learning_rate": 0.0}, "learning_rate is 0.0"),
+        ({"gradient_clip": 0.0}, "give gradient_clip=None"),
+        ({"extra_state_probability": 1.1}, r"extra_state_probability is 1.1, expected a number in \[0, 1\]"),
+        ({"ema_decay": 1.5}, r"ema_decay is 1.5, expected a number in \[0, 1\]"),
+    ],
+)
+def test_config_refuses(changes, message):
+    with pytest.raises(ValueError, match=message):
+        PlannerConfig(**changes)
