@@ -81,7 +81,7 @@ class PlannerConfig:
     ema_warmup: bool = True  # without it 37 % of the initial weights remain after 10,000 steps
     weight_factor: float = 2.0  # paper: beta in the window weight exp(beta * (value - 1))
     # What that value is: "rank", the part of all windows that are worth less, so that beta picks as much of any data
-    # (measured, results/README.md), or "range", between the lowest and the highest value of the data (paper)
+    # (measured, docs/said.md), or "range", between the lowest and the highest value of the data (paper)
     value_scale: str = "rank"
     precision: str = "auto"  # bfloat16 autocast where the hardware has it; or "float32", "bfloat16"
 
