@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import itertools
 import json
 import multiprocessing
 import re
@@ -34,6 +35,10 @@ examples:
   # the same call goes on where it was stopped; with another run or delay, only what is new is played
   python scripts/over_delays.py any=logs/said/Hopper-v5-delay0-16_1 d8=logs/sadr/Hopper-v5-delay8_1/best_model.zip \\
       --delays 0 2 4 8 12 16 20 --json hopper.json --workers 2
+
+  # runs that share a label are one row: each plays the delay that it was trained under
+  python scripts/over_delays.py any=logs/said/Hopper-v5-delay0-16_1 each=logs/said/Hopper-v5-delay0_1 \\
+      each=logs/said/Hopper-v5-delay4_1 each=logs/said/Hopper-v5-delay16_1 --delays 0 4 16 --json hopper.json
 
 Of a SAID agent, the planner and the expert are played. An agent cannot play delays that it was not built for: such a
 cell stays empty. It does play delays that it was not trained with, which is the point here, without a warning.
@@ -94,9 +99,10 @@ def main(argv: list[str] | None = None) -> None:
             plots.panels()  # without matplotlib, fail now and not after the episodes
         delays = list(dict.fromkeys(read_name(word) for word in args.delays))
         runs = open_runs(args)
-        env_id = next(iter(runs.values())).info["env"]
+        first = next(iter(runs.values()))[0]
+        env_id = first.info["env"]
         settings = {"env": env_id, "n_episodes": args.episodes, "seed": args.seed, "deterministic": True}
-        cells = [cell for label, run in runs.items() for cell in cells_of(label, run, delays)]
+        cells = [cell for label, row in runs.items() for cell in cells_of(label, row, delays)]
         results = Results(args.json, settings, cells)
     except ValueError as error:
         parser.error(str(error))
@@ -110,7 +116,7 @@ def main(argv: list[str] | None = None) -> None:
     last_seed = args.seed + args.episodes - 1
     print(f"{env_id}, reset seeds {args.seed}..{last_seed}: {len(todo)} of {len(cells)} cells to play")
     if todo:
-        results.origins.append(origin(next(iter(runs.values()))))
+        results.origins.append(origin(first))
     try:
         for done, (cell, summary) in enumerate(play_all(todo, env_id, args), 1):
             results.add(cell, summary)
@@ -138,20 +144,25 @@ def read_name(word: str) -> int | str:
     return process.delay if isinstance(process, FixedDelay) else word
 
 
-def open_runs(args: argparse.Namespace) -> dict[str, LoadedRun]:
-    """Return what each label names.
+def open_runs(args: argparse.Namespace) -> dict[str, list[LoadedRun]]:
+    """Return what each label names: one run, or one for each of several delays.
 
-    :raises ValueError: for what cannot be opened, two runs of one label, or runs of several tasks
+    :raises ValueError: for what cannot be opened, runs of one label and one delay, or runs of several tasks
     """
-    runs: dict[str, LoadedRun] = {}
+    runs: dict[str, list[LoadedRun]] = {}
     for text in args.runs:
         given, path = re.fullmatch(r"(?:([^=/]+)=)?(.*)", text, re.DOTALL).groups()  # type: ignore[union-attr]  # fits all
         label = given or "/".join(Path(path).absolute().parts[-2:]).removesuffix(".zip")
-        if label in runs:
-            raise ValueError(f"Two runs have the label {label}: give each its own, as in LABEL={path}.")
-        runs[label] = open_run(path, args.algo, args.env, None, args.device)
-    tasks = {label: run.info["env"] for label, run in runs.items()}
-    if len(set(tasks.values())) > 1:
+        run = open_run(path, args.algo, args.env, None, args.device)
+        row = runs.setdefault(label, [])
+        if any(run.info["delay"] == other.info["delay"] for other in row):
+            raise ValueError(
+                f"Two runs have the label {label} and the delay {run.info['delay']}: give each its own label, as in "
+                f"LABEL={path}."
+            )
+        row.append(run)
+    tasks = {label: sorted({run.info["env"] for run in row}) for label, row in runs.items()}
+    if len({task for names in tasks.values() for task in names}) > 1:
         raise ValueError(f"Returns of several tasks cannot be compared: {tasks}. Give runs of one task, or --env.")
     return runs
 
@@ -163,23 +174,35 @@ def open_run(path: str, algo: str | None, env_id: str | None, delay: Delay, devi
         return load_run(path, algo, env_id, delay, device)
 
 
-def cells_of(label: str, run: LoadedRun, delays: list[int | str]) -> Iterator[Cell]:
-    """Make the cells of a run: each who can answer, under each delay."""
-    file = run.info["file"]
-    digest = hashlib.sha256(Path(file).read_bytes()).hexdigest()
-    who: list[str | None] = [*answers(run.model)] or [None]
-    for answer in who:
+def cells_of(label: str, row: list[LoadedRun], delays: list[int | str]) -> Iterator[Cell]:
+    """Make the cells of a label: each who can answer, under each delay.
+
+    :param row: one run, which plays all delays, or several, of which each plays the delay it was trained under
+    """
+    files = [run.info["file"] for run in row]
+    digests = {file: hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in files}
+    who: list[list[str | None]] = [[*answers(run.model)] or [None] for run in row]
+    for answer in dict.fromkeys(itertools.chain(*who)):
         for delay in delays:
-            yield Cell(
-                agent=f"{label} {answer}" if answer else label,
-                answer=answer,
-                delay=delay,
-                algo=run.info["algo"],
-                file=file,
-                sha256=digest,
-                trained_steps=run.info["trained_steps"],
-                obstacle=obstacle(run.model, answer, delay),
-            )
+            for run, file, can_answer in zip(row, files, who, strict=True):
+                plays = len(row) == 1 or run.info["delay"] == written(delay)
+                if not (plays and answer in can_answer):
+                    continue
+                yield Cell(
+                    agent=f"{label} {answer}" if answer else label,
+                    answer=answer,
+                    delay=delay,
+                    algo=run.info["algo"],
+                    file=file,
+                    sha256=digests[file],
+                    trained_steps=run.info["trained_steps"],
+                    obstacle=obstacle(run.model, answer, delay),
+                )
+
+
+def written(delay: int | str) -> int | str:
+    """Write a delay as a loaded run does, whatever its spelling."""
+    return delay if isinstance(delay, int) else str(make_process(delay))
 
 
 def obstacle(model: Any, answer: str | None, delay: int | str) -> str | None:

@@ -98,6 +98,23 @@ def test_cells_are_what_evaluate_measures(
     assert plot.read_bytes()[:4] == b"\x89PNG"
 
 
+def test_runs_of_one_label_play_each_its_own_delay(
+    said: Path, sadr: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    random = write_run(tmp_path / "random", DelayedSAC, (0, 1))
+    runs = [f"each={said}", f"each={sadr}", f"each={random}", f"one={sadr}"]
+    document = play(tmp_path / "out.json", runs, ["0", "1", "2", "EpisodeDelay(0,1)"])
+    files = {(cell["agent"], cell["delay"]): Path(cell["file"]).parent for cell in document["cells"] if cell["result"]}
+    assert files == {
+        ("each planner", 2): said, ("each expert", 2): said, ("each", 1): sadr, ("each", "EpisodeDelay(0,1)"): random,
+        ("one", 0): sadr, ("one", 1): sadr, ("one", "EpisodeDelay(0,1)"): sadr,
+    }  # fmt: skip
+    cells = by_cell(document)
+    assert cells["each", 1] == cells["one", 1]  # the same file, played once or twice
+    row = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("| each  "))
+    assert [word.strip() == "-" for word in row.split("|")[2:5]] == [True, False, True]  # delays 0, 1, 2
+
+
 def test_what_was_played_is_not_played_again(said: Path, sadr: Path, tmp_path: Path, monkeypatch) -> None:
     file = tmp_path / "out.json"
     played = count_plays(monkeypatch, stop_after=4)
