@@ -24,7 +24,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from zoo import ALGOS, WRAPPER, Delay, largest_delay
 
 from sb3_said import DelayedSAC
-from sb3_said.common.buffers import has_state_history
+from sb3_said.common.spaces import has_state_history
 from sb3_said.delays import FixedDelay
 from sb3_said.evaluation.rollout import Observation
 

@@ -15,7 +15,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import configure_logger
 
-from sb3_said.common.buffers import has_state_history
+from sb3_said.common.spaces import has_state_history
 from sb3_said.delays.combined import fixed_delay
 from sb3_said.delays.processes import DelayProcess
 from sb3_said.planner.config import SAMPLING_SETTINGS

@@ -368,22 +368,6 @@ def test_tails_are_reused():
 # ---------------------------------------------------------------------------------------------------- refusals
 
 
-@pytest.mark.parametrize(
-    ("observation_space", "action_space", "reason"),
-    [
-        (spaces.Box(-1, 1, (3, 3)), spaces.Box(-1, 1, (2,)), "FlattenObservation"),
-        (spaces.Discrete(3), spaces.Box(-1, 1, (2,)), "FlattenObservation"),
-        (spaces.Dict(observation=spaces.Box(-1, 1, (3,))), spaces.Box(-1, 1, (2,)), "wrap the task"),
-        (spaces.Box(-1, 1, (3,)), spaces.Discrete(2), "RescaleAction"),
-        (spaces.Box(-1, 1, (3,)), spaces.Box(-1, np.inf, (2,)), "RescaleAction"),
-        (spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (2, 2)), "RescaleAction"),
-    ],
-)
-def test_other_spaces_are_refused_with_a_reason(observation_space, action_space, reason):
-    with pytest.raises(ValueError, match=reason):
-        DelayedReplayBuffer(100, observation_space, action_space)
-
-
 def test_sb3s_memory_option_is_refused():
     with pytest.raises(ValueError, match="optimize_memory_usage=False"):
         make_buffer(Player(), optimize_memory_usage=True)
