@@ -45,6 +45,9 @@ class DelayedReplayBuffer(ReplayBuffer):
     :param n_envs: parallel environments
     :param optimize_memory_usage: accepted for SB3's sake; must be False, as memory is optimized anyway
     :param handle_timeout_termination: bootstrap at time limits
+    :param exchanged_ages: part of the sampled transitions that are shown as they would have been observed at another
+        one's age, in [0, 1]. The true states are all known, so that an episode under one delay teaches the others too;
+        where there is but one delay, nothing changes
     :raises ValueError: for other spaces, or when the buffer cannot hold more steps than the largest delay
     """
 
@@ -59,11 +62,15 @@ class DelayedReplayBuffer(ReplayBuffer):
         n_envs: int = 1,
         optimize_memory_usage: bool = False,
         handle_timeout_termination: bool = True,
+        exchanged_ages: float = 0.0,
     ):
         BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_envs=n_envs)
         if optimize_memory_usage:
             raise ValueError("DelayedReplayBuffer stores each state once already; leave optimize_memory_usage=False.")
         self.optimize_memory_usage = False
+        if not 0.0 <= exchanged_ages <= 1.0:
+            raise ValueError(f"exchanged_ages is a part of the transitions in [0, 1], got {exchanged_ages}.")
+        self.exchanged_ages = exchanged_ages
         self.handle_timeout_termination = handle_timeout_termination
         self.buffer_size = max(buffer_size // n_envs, 1)
         self.is_delayed = isinstance(observation_space, spaces.Dict)
@@ -255,6 +262,8 @@ class DelayedReplayBuffer(ReplayBuffer):
             return ReplayBufferSamples(*(self.to_torch(np.asarray(part)) for part in data))
 
         ages = self.ages[rows, envs]
+        if self.exchanged_ages > 0.0:
+            self._exchange(ages, next_ages, self.steps[rows, envs])
         history = self._histories(rows, envs)  # (B, D, act_dim)
         next_history = np.concatenate([history, actions[:, None]], axis=1)[:, 1:]
         past = self.observations[(rows + 1 - next_ages) % self.buffer_size, envs]  # (B, obs_dim)
@@ -290,6 +299,25 @@ class DelayedReplayBuffer(ReplayBuffer):
         newest = rows == (self.pos - 1) % self.buffer_size
         states[newest], ages[newest] = self._next_states[envs[newest]], self._next_ages[envs[newest]]
         return states, ages
+
+    def _exchange(self, ages: np.ndarray, next_ages: np.ndarray, steps: np.ndarray) -> None:
+        """Give a part of the transitions the ages of others, in place, but none that reach before their episode.
+
+        A pair (age, next age) stays together: so ages change from step to step as they do in play. Ages that only the
+        start of an episode keeps small are not handed on, which leaves a fixed delay as it is.
+
+        :param ages: (B,)
+        :param next_ages: (B,)
+        :param steps: (B,) of each transition within its episode
+        """
+        takers = np.flatnonzero(np.random.random(len(ages)) < self.exchanged_ages)
+        givers = np.flatnonzero(ages < steps)
+        if givers.size:
+            givers = np.random.choice(givers, takers.size)
+            ages[takers], next_ages[takers] = (
+                np.minimum(ages[givers], steps[takers]),
+                np.minimum(next_ages[givers], steps[takers] + 1),
+            )
 
     def _histories(self, rows: np.ndarray, envs: np.ndarray) -> np.ndarray:
         """Return the actions a_{t-D..t-1}, zeros before the episode: (B, D, act_dim)."""

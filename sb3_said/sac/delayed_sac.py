@@ -54,6 +54,9 @@ class DelayedSAC(SafeSaveMixin, SAC):
     :param learning_rate: of actor, critics and entropy coefficient; a number or a schedule
     :param augment_state: the actor reads [observation, action history, age]
     :param delay_reconciled_critic: the critics read the true state
+    :param exchanged_ages: part of the transitions of an update that are seen at the age another was observed at, in
+        [0, 1]: where delays vary, each step teaches the actor what to do under the others too. Measured at delays 0..16
+        (results/README.md); 0 is SADR as published, and under one fixed delay there is no difference
     :param precision: of the matrix products between hidden layers in updates: ``"float32"``; ``"bfloat16"``, which is
         faster; or ``"auto"``, bfloat16 where the hardware has it. All else, acting and gSDE (``use_sde``) are float32
     :param sac_kwargs: every other argument of :class:`stable_baselines3.SAC`
@@ -78,6 +81,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
         *,
         augment_state: bool = True,
         delay_reconciled_critic: bool = True,
+        exchanged_ages: float = 0.5,
         precision: str = "float32",
         **sac_kwargs: Any,
     ):
@@ -92,16 +96,18 @@ class DelayedSAC(SafeSaveMixin, SAC):
         self.trained_delay: str | None = None  # what made the delays it has learned from, written out
         self.augment_state = augment_state
         self.delay_reconciled_critic = delay_reconciled_critic
+        self.exchanged_ages = exchanged_ages
         if isinstance(policy, str):  # SB3 would refuse one of the two names, by the kind of space
             policy = self.policy_aliases.get(policy, policy)  # type: ignore[assignment]
         super().__init__(policy, env, learning_rate, **sac_kwargs)
 
     def _setup_model(self) -> None:
         self._check_parts()
-        user_kwargs = self.policy_kwargs
-        self.policy_kwargs = {**user_kwargs, **self._policy_flags()}
+        user_kwargs = self.policy_kwargs, self.replay_buffer_kwargs
+        self.policy_kwargs = {**self.policy_kwargs, **self._policy_flags()}
+        self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "exchanged_ages": self.exchanged_ages}
         super()._setup_model()
-        self.policy_kwargs = user_kwargs
+        self.policy_kwargs, self.replay_buffer_kwargs = user_kwargs
         if self.log_ent_coef is not None:
             self.ent_coef_optimizer = FusedAdam([self.log_ent_coef], lr=self.lr_schedule(1))
 
@@ -121,6 +127,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
             )
         if twice := sorted(self._policy_flags().keys() & self.policy_kwargs.keys()):
             raise ValueError(f"Give {', '.join(twice)} to {name} itself, not in policy_kwargs.")
+        if "exchanged_ages" in self.replay_buffer_kwargs:
+            raise ValueError(f"Give exchanged_ages to {name} itself, not in replay_buffer_kwargs.")
         vec_normalize = self.get_vec_normalize_env()
         if isinstance(self.observation_space, spaces.Dict) and vec_normalize is not None and vec_normalize.norm_obs:
             keys = vec_normalize.norm_obs_keys or []

@@ -116,6 +116,63 @@ def test_samples_are_the_transitions_themselves_however_ages_jump(process, recei
     assert_exact(fill(make_buffer(player, process.max_delay + spare), rows), rows)
 
 
+def pasts_and_rows(rows):
+    """Map the tag of each true state to the states of its episode up to the next one, its row and its environment."""
+    found = {}
+    for env in range(len(rows[0].done)):
+        past = []
+        for row in rows:
+            past = [*past, row.states[env]]
+            found[int(row.states[env, 0])] = [*past, row.next_states[env]], row, env
+            if row.done[env] or row.interrupted:
+                past = []
+    return found
+
+
+@settings(max_examples=150, deadline=None)
+@given(players_and_sizes(), st.integers(1, 90), st.sampled_from([0.3, 1.0]))
+def test_exchanged_ages_show_what_would_have_been_observed_at_them(player_and_size, n_steps, part):
+    player, steps_per_env = player_and_size
+    rows = player.play(n_steps)
+    found = pasts_and_rows(rows)
+    sampled = batch_arrays(fill(make_buffer(player, steps_per_env, exchanged_ages=part), rows).sample(300))
+    ages, next_ages = (sampled[f"{name}/delay"][:, 0].astype(int) for name in ("observations", "next_observations"))
+    assert np.all(next_ages <= ages + 1)
+    for i, tag in enumerate(sampled[f"observations/{UNDELAYED}"][:, 0].astype(int)):
+        states, row, env = found[tag]
+        seen = {"observations/observation": states[:-1][-1 - ages[i]], "observations/delay": ages[i]}
+        seen |= {"next_observations/observation": states[-1 - next_ages[i]], "next_observations/delay": next_ages[i]}
+        for name, expected in (
+            naive_transition(row, env, player.vec.observation_space["action_history"].shape[0]) | seen
+        ).items():
+            np.testing.assert_array_equal(sampled[name][i].squeeze(), np.squeeze(expected), err_msg=name)
+
+
+@pytest.mark.parametrize("part", [0.0, 0.4, 1.0])
+def test_that_part_of_the_ages_is_exchanged(part):
+    player = Player(delay=(0, 4), max_length=60)
+    rows = player.play(1500)
+    found = pasts_and_rows(rows)
+    np.random.seed(0)
+    sampled = batch_arrays(fill(make_buffer(player, 2000, exchanged_ages=part), rows).sample(20_000))
+    transitions = [found[tag] for tag in sampled[f"observations/{UNDELAYED}"][:, 0]]
+    late = np.array([len(states) > 6 for states, _, _ in transitions])  # before, the largest ages do not fit
+    own = np.array([row.obs["delay"][env, 0] for _, row, env in transitions])[late]
+    shown = sampled["observations/delay"][late, 0]
+    # Of a mixture of the own age and an independent one of the same distribution
+    assert np.corrcoef(own, shown)[0, 1] == pytest.approx(1.0 - part, abs=0.03)
+    for age in range(5):
+        assert np.mean(shown == age) == pytest.approx(np.mean(own == age), abs=0.02)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 5), st.sampled_from([1, 3, 10, 30]), st.integers(0, 2**16))
+def test_of_one_delay_there_is_nothing_to_exchange(delay, max_length, seed):
+    player = Player(delay=delay, max_delay=5, max_length=max_length, seed=seed)
+    rows = player.play(60)
+    assert_exact(fill(make_buffer(player, 20, exchanged_ages=1.0), rows), rows)
+
+
 @settings(max_examples=60, deadline=None)
 @given(players_and_sizes(), st.integers(0, 70), st.integers(1, 50), st.integers(0, 40))
 def test_a_restored_replay_goes_on_as_if_never_saved(player_and_size, n_before, n_after, n_other):
@@ -380,6 +437,12 @@ def test_a_buffer_shorter_than_the_delay_names_the_smallest_that_works(n_envs):
         make_buffer(player, 5)
     rows = player.play(40)
     assert_exact(fill(make_buffer(player, 6), rows), rows)
+
+
+@pytest.mark.parametrize("part", [-0.1, 1.5])
+def test_only_a_part_of_the_ages_can_be_exchanged(part):
+    with pytest.raises(ValueError, match=r"in \[0, 1\]"):
+        make_buffer(Player(), exchanged_ages=part)
 
 
 def test_an_empty_buffer_has_nothing_to_give():
