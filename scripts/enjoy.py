@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from runs import answering, load_run
+from runs import ANSWERS, answering, load_run
 from zoo import add_delay, read_delay
 
 from sb3_said.evaluation import rollout
@@ -42,7 +42,7 @@ def make_parser() -> argparse.ArgumentParser:
                         "by leaving out steps (default: 25)")  # fmt: skip
     parser.add_argument("--episodes", type=int, default=1, help="whole episodes (default: 1)")
     parser.add_argument("--seed", type=int, default=10_000, help="reset seed of the first episode (default: 10000)")
-    parser.add_argument("--answer", choices=("planner", "expert"), help="who acts in a SAID agent (default: the agent)")
+    parser.add_argument("--answer", choices=ANSWERS, help="who acts in a SAID agent (default: the agent)")
     parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the best")
     parser.add_argument("--algo", help="algorithm of a .zip without its run folder")
     parser.add_argument("--env", help="task to play (default: the trained one)")

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from runs import LoadedRun, answering, answers, load_run, longest_delay, origin
+from runs import ANSWERS, LoadedRun, answering, answers, load_run, longest_delay, origin
 from zoo import Delay, largest_delay, read_delay
 
 from sb3_said.common.files import write_json
@@ -40,8 +40,9 @@ examples:
   python scripts/over_delays.py any=logs/said/Hopper-v5-delay0-16_1 each=logs/said/Hopper-v5-delay0_1 \\
       each=logs/said/Hopper-v5-delay4_1 each=logs/said/Hopper-v5-delay16_1 --delays 0 4 16 --json hopper.json
 
-Of a SAID agent, the planner and the expert are played. An agent cannot play delays that it was not built for: such a
-cell stays empty. It does play delays that it was not trained with, which is the point here, without a warning.
+Of a SAID agent, the planner and the expert are played, or one of them (--answer). An agent cannot play delays that it
+was not built for: such a cell stays empty. It does play delays that it was not trained with, which is the point here,
+without a warning.
 Episode i starts from reset seed --seed + i under every delay, so that all cells meet the same starts. An average over
 delays has an interval over these starts, each with its mean over the delays.
 What --json holds of the same agents (by the contents of their files) is not played again; an agent that has changed
@@ -57,6 +58,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("runs", nargs="+", metavar="[LABEL=]RUN_OR_ZIP", help="run folders, or agents' .zip files")
     parser.add_argument("--delays", nargs="+", required=True, metavar="DELAY", help="each a number of control steps, "
                         "or a process of docs/delays.md in quotes, such as 'DroppedPackets(4, p=0.1)'")  # fmt: skip
+    parser.add_argument("--answer", choices=ANSWERS, help="of SAID agents, play this one alone (default: both)")
     parser.add_argument("--json", type=Path, required=True, help="where to write the numbers, and to go on from them")
     parser.add_argument("--plot", type=Path, help="draw return over delay to this .png or .pdf")
     parser.add_argument("--episodes", type=int, default=20, help="whole episodes for each cell (default: 20)")
@@ -102,7 +104,7 @@ def main(argv: list[str] | None = None) -> None:
         first = next(iter(runs.values()))[0]
         env_id = first.info["env"]
         settings = {"env": env_id, "n_episodes": args.episodes, "seed": args.seed, "deterministic": True}
-        cells = [cell for label, row in runs.items() for cell in cells_of(label, row, delays)]
+        cells = [cell for label, row in runs.items() for cell in cells_of(label, row, delays, args.answer)]
         results = Results(args.json, settings, cells)
     except ValueError as error:
         parser.error(str(error))
@@ -174,15 +176,18 @@ def open_run(path: str, algo: str | None, env_id: str | None, delay: Delay, devi
         return load_run(path, algo, env_id, delay, device)
 
 
-def cells_of(label: str, row: list[LoadedRun], delays: list[int | str]) -> Iterator[Cell]:
+def cells_of(label: str, row: list[LoadedRun], delays: list[int | str], only: str | None = None) -> Iterator[Cell]:
     """Make the cells of a label: each who can answer, under each delay.
 
     :param row: one run, which plays all delays, or several, of which each plays the delay it was trained under
+    :param only: who of a SAID agent is to answer, planner or expert; both by default
     """
     files = [run.info["file"] for run in row]
     digests = {file: hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in files}
     who: list[list[str | None]] = [[*answers(run.model)] or [None] for run in row]
     for answer in dict.fromkeys(itertools.chain(*who)):
+        if None not in (answer, only) and answer != only:
+            continue
         for delay in delays:
             for run, file, can_answer in zip(row, files, who, strict=True):
                 plays = len(row) == 1 or run.info["delay"] == written(delay)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import gymnasium as gym
 import torch as th
@@ -27,6 +27,9 @@ from sb3_said import DelayedSAC
 from sb3_said.common.spaces import has_state_history
 from sb3_said.delays import FixedDelay
 from sb3_said.evaluation.rollout import Observation
+from sb3_said.said.policies import Answer
+
+ANSWERS = get_args(Answer)  # the planner's first, once it is trained
 
 
 @dataclass(frozen=True)
@@ -109,7 +112,7 @@ def answers(model: BaseAlgorithm) -> list[str]:
     """Return who can answer for a model by name: SAID's expert, and its planner once that is trained."""
     if not hasattr(model.policy, "answering"):
         return []
-    return ["planner", "expert"] if model.policy.planner_is_trained else ["expert"]
+    return list(ANSWERS if model.policy.planner_is_trained else ANSWERS[1:])
 
 
 def answering(model: BaseAlgorithm, answer: str | None) -> AbstractContextManager[Any]:

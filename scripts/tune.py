@@ -14,7 +14,7 @@ from typing import Any
 import torch as th
 from evaluate import evaluate
 from optuna.trial import FrozenTrial
-from runs import LoadedRun, load_run, origin
+from runs import ANSWERS, LoadedRun, load_run, origin
 from study import Search, describe, returns_of, save_plots
 from winner import RunConfig
 
@@ -249,7 +249,7 @@ def report(
         how = Namespace(
             episodes=args.report_episodes, seed=args.report_seed, n_envs=8, stochastic=False, latency_calls=100
         )
-        played = [evaluate(run, answer, how).to_dict() for answer in ("planner", "expert")]
+        played = [evaluate(run, answer, how).to_dict() for answer in ANSWERS]
     assert isinstance(run.model, SAID)
     run.model.save(folder / "best.zip")
     config = RunConfig.read(args.run)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, fields
 from itertools import product
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch as th
@@ -83,7 +83,7 @@ class SAIDPolicy(DelayedSACPolicy):
         :param who: ``"planner"`` or ``"expert"``
         :raises ValueError: for another name, or for a planner that is not trained
         """
-        if who not in ("planner", "expert"):
+        if who not in get_args(Answer):
             raise ValueError(f"Only the 'planner' or the 'expert' can answer, got {who!r}.")
         if who == "planner" and not self.planner_is_trained:
             raise ValueError("The planner is not trained yet; call learn() or train_planner() first.")

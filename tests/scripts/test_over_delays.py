@@ -115,6 +115,12 @@ def test_runs_of_one_label_play_each_its_own_delay(
     assert [word.strip() == "-" for word in row.split("|")[2:5]] == [True, False, True]  # delays 0, 1, 2
 
 
+@pytest.mark.parametrize("answer", ["planner", "expert"])
+def test_one_answer_alone_can_be_asked_for(said: Path, sadr: Path, tmp_path: Path, answer: str) -> None:
+    document = play(tmp_path / "out.json", [f"a={said}", f"b={sadr}"], ["1"], "--answer", answer)
+    assert [*by_cell(document)] == [(f"a {answer}", 1), ("b", 1)]  # another algorithm's agent has but one
+
+
 def test_what_was_played_is_not_played_again(said: Path, sadr: Path, tmp_path: Path, monkeypatch) -> None:
     file = tmp_path / "out.json"
     played = count_plays(monkeypatch, stop_after=4)
