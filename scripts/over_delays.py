@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from runs import ANSWERS, LoadedRun, answering, answers, load_run, longest_delay, origin
+from runs import ANSWERS, LoadedRun, answering, answers, delay_name, load_run, longest_delay, origin
 from zoo import Delay, largest_delay, read_delay
 
 from sb3_said.common.files import write_json
@@ -190,7 +190,7 @@ def cells_of(label: str, row: list[LoadedRun], delays: list[int | str], only: st
             continue
         for delay in delays:
             for run, file, can_answer in zip(row, files, who, strict=True):
-                plays = len(row) == 1 or run.info["delay"] == written(delay)
+                plays = len(row) == 1 or run.info["delay"] == delay_name(make_process(delay))
                 if not (plays and answer in can_answer):
                     continue
                 yield Cell(
@@ -203,11 +203,6 @@ def cells_of(label: str, row: list[LoadedRun], delays: list[int | str], only: st
                     trained_steps=run.info["trained_steps"],
                     obstacle=obstacle(run.model, answer, delay),
                 )
-
-
-def written(delay: int | str) -> int | str:
-    """Write a delay as a loaded run does, whatever its spelling."""
-    return delay if isinstance(delay, int) else str(make_process(delay))
 
 
 def obstacle(model: Any, answer: str | None, delay: int | str) -> str | None:

@@ -25,11 +25,11 @@ from zoo import ALGOS, WRAPPER, Delay, largest_delay
 
 from sb3_said import DelayedSAC
 from sb3_said.common.spaces import has_state_history
-from sb3_said.delays import FixedDelay
+from sb3_said.delays import DelayProcess, FixedDelay
 from sb3_said.evaluation.rollout import Observation
 from sb3_said.said.policies import Answer
 
-ANSWERS = get_args(Answer)  # the planner's first, once it is trained
+ANSWERS = get_args(Answer)
 
 
 @dataclass(frozen=True)
@@ -101,18 +101,23 @@ def load_run(
     info = {
         "algo": algo,
         "env": env_id,
-        "delay": delay_process.delay if isinstance(delay_process, FixedDelay) else str(delay_process),
+        "delay": delay_name(delay_process),
         "file": str(file),
         "trained_steps": model.num_timesteps,
     }
     return LoadedRun(model, make_env, _load_normalize(params, hyperparams, make_env), file.parent, info)
 
 
+def delay_name(process: DelayProcess) -> int | str:
+    """Return the number of a fixed delay, and another process written out."""
+    return process.delay if isinstance(process, FixedDelay) else str(process)
+
+
 def answers(model: BaseAlgorithm) -> list[str]:
     """Return who can answer for a model by name: SAID's expert, and its planner once that is trained."""
     if not hasattr(model.policy, "answering"):
         return []
-    return list(ANSWERS if model.policy.planner_is_trained else ANSWERS[1:])
+    return [who for who in ANSWERS if who != "planner" or model.policy.planner_is_trained]
 
 
 def answering(model: BaseAlgorithm, answer: str | None) -> AbstractContextManager[Any]:

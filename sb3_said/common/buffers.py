@@ -48,7 +48,8 @@ class DelayedReplayBuffer(ReplayBuffer):
     :param exchanged_ages: part of the sampled transitions that are shown as they would have been observed at another
         one's age, in [0, 1]. The true states are all known, so that an episode under one delay teaches the others too;
         where there is but one delay, nothing changes
-    :raises ValueError: for other spaces, or when the buffer cannot hold more steps than the largest delay
+    :raises ValueError: for other spaces, a part outside [0, 1], or when the buffer cannot hold more steps than the
+        largest delay
     """
 
     next_observations: None  # type: ignore[assignment]  # rebuilt, never stored
@@ -313,11 +314,9 @@ class DelayedReplayBuffer(ReplayBuffer):
         takers = np.flatnonzero(np.random.random(len(ages)) < self.exchanged_ages)
         givers = np.flatnonzero(ages < steps)
         if givers.size:
-            givers = np.random.choice(givers, takers.size)
-            ages[takers], next_ages[takers] = (
-                np.minimum(ages[givers], steps[takers]),
-                np.minimum(next_ages[givers], steps[takers] + 1),
-            )
+            drawn = np.random.choice(givers, takers.size)
+            ages[takers] = np.minimum(ages[drawn], steps[takers])
+            next_ages[takers] = np.minimum(next_ages[drawn], steps[takers] + 1)
 
     def _histories(self, rows: np.ndarray, envs: np.ndarray) -> np.ndarray:
         """Return the actions a_{t-D..t-1}, zeros before the episode: (B, D, act_dim)."""
