@@ -139,6 +139,7 @@ def plot_over_delays(table: Mapping[str, Mapping[int | str, Summary]]) -> list[A
     for ax, plot in zip(axes, kinds, strict=True):
         plot(table, ax)
         ax.sharey(axes[0])
+    axes[0].autoscale_view()  # sharing alone leaves the limits of the first
     axes[0].set_ylabel("return of an episode (undiscounted)")
     figure = axes[0].get_figure(root=True)
     assert figure is not None  # for mypy: axes of `panels` have one

@@ -66,20 +66,21 @@ def test_return_over_delay(png: Path) -> None:
 
     table: dict[str, dict[int | str, Summary]] = {
         "any": {"WIFI_20MS": summary(3.0, 5.0), 8: summary(1.0, 3.0), 0: summary(10.0)},
-        "short": {0: summary(7.0, 9.0), "RandomWalkDelay(0, 16, move_prob=0.1)": summary(6.0, 6.0)},
+        "short": {0: summary(7.0, 9.0), "RandomWalkDelay(0, 16, move_prob=0.1)": summary(-6.0, -6.0)},
     }
     fixed, random = plots.plot_over_delays(table)
     lines = [container.lines[0].get_xydata().tolist() for container in fixed.containers]
     assert lines == [[[0.0, 10.0], [8.0, 2.0]], [[0.0, 8.0]]]  # in the order of delays, whatever that of the table
     points = [container.lines[0].get_xydata() for container in random.containers]
     assert [np.round(p[:, 0]).tolist() for p in points] == [[0.0], [1.0]]  # under the tick of their delay
-    assert [p[:, 1].tolist() for p in points] == [[4.0], [6.0]]
+    assert [p[:, 1].tolist() for p in points] == [[4.0], [-6.0]]
     interval = table["any"]["WIFI_20MS"].mean_return
     (bar,) = random.containers[0].lines[2][0].get_segments()
     np.testing.assert_allclose(bar[:, 1], [interval.low, interval.high])
     labels = [label.get_text() for label in random.get_xticklabels()]
     assert labels == ["WIFI_20MS", "RandomWalkDelay\n(0, 16,\nmove_prob=0.1)"]
     assert fixed.get_ylim() == random.get_ylim()
+    assert fixed.get_ylim()[0] < -6.0 and fixed.get_ylim()[1] > 10.0  # markers of either panel are inside both
     plots.save(fixed, png)
     assert drawn(png)
     only_fixed = {agent: {d: s for d, s in row.items() if isinstance(d, int)} for agent, row in table.items()}
