@@ -11,6 +11,7 @@ import re
 import warnings
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -170,10 +171,17 @@ def open_runs(args: argparse.Namespace) -> dict[str, list[LoadedRun]]:
 
 
 def open_run(path: str, algo: str | None, env_id: str | None, delay: Delay, device: str) -> LoadedRun:
-    """Open a run without the warning that it was not trained with this delay, which is what is measured here."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", r"This \w+ learned under .* and is given", UserWarning)
+    """Open a run, whatever it was trained with."""
+    with at_any_age():
         return load_run(path, algo, env_id, delay, device)
+
+
+@contextmanager
+def at_any_age() -> Iterator[None]:
+    """Leave out the warning that an agent was not trained at some ages, which is what is measured here."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", r"This \w+ learned at ages .* and is given", UserWarning)
+        yield
 
 
 def cells_of(label: str, row: list[LoadedRun], delays: list[int | str], only: str | None = None) -> Iterator[Cell]:
@@ -292,7 +300,7 @@ def play_all(cells: list[Cell], env_id: str, args: argparse.Namespace) -> Iterat
 def play(cell: Cell, env_id: str, episodes: int, seed: int, n_envs: int, device: str) -> Summary:
     """Play the episodes of a cell."""
     run = open_run(cell.file, cell.algo, env_id, cell.delay, device)
-    with answering(run.model, cell.answer):
+    with answering(run.model, cell.answer), at_any_age():
         played = rollout(run.model, run.make_env, episodes, seed, n_envs, normalize=run.normalize)
     return Summary.from_episodes(cell.agent, played.returns, played.lengths)
 

@@ -27,6 +27,7 @@ from sb3_said import DelayedSAC
 from sb3_said.common.spaces import has_state_history
 from sb3_said.delays import DelayProcess, FixedDelay
 from sb3_said.evaluation.rollout import Observation
+from sb3_said.sac.delayed_sac import ages_of
 from sb3_said.said.policies import Answer
 
 ANSWERS = get_args(Answer)
@@ -63,7 +64,8 @@ def load_run(
     :param path: a run folder such as ``logs/said/Hopper-v5-delay4_1``, or an agent's ``.zip``
     :param algo: name of the algorithm; read from the run folder where there is one
     :param env_id: task to play; the one of the run folder by default
-    :param delay: observation delay to play under; the trained one by default
+    :param delay: observation delay to play under; the trained one by default, and outside a run folder the largest that
+        the agent was built for
     :param device: torch device
     :param env_kwargs: more arguments for ``gymnasium.make``, such as ``render_mode``
     :raises ValueError: when the files do not say what to load, or the agent does not fit the task
@@ -95,9 +97,9 @@ def load_run(
     env = make_env()
     _check_spaces(model, env, file)
     delay_process = env.get_wrapper_attr("process") if env.has_wrapper_attr("process") else FixedDelay(0)
-    env.close()
     if isinstance(model, DelayedSAC):
-        model.check_delay(delay_process)
+        model.check_ages(ages_of(env))
+    env.close()
     info = {
         "algo": algo,
         "env": env_id,

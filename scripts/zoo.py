@@ -8,6 +8,7 @@ import json
 import os
 import re
 import sys
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,8 +27,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC, PlannerTrainingCallback
 from sb3_said.common.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback, restore_training
 from sb3_said.common.files import write_json
-from sb3_said.delays.combined import fixed_delay
-from sb3_said.delays.processes import make_process
+from sb3_said.delays.processes import age_range, make_process
 
 #: A delay as YAML has it: control steps, [low, high], or a process as text; None for a task without the wrapper.
 Delay = int | list[int] | str | None
@@ -96,18 +96,21 @@ def largest_delay(delay: Delay) -> int:
     return 0 if delay is None else make_process(delay).max_delay
 
 
-def varies(delay: Delay) -> bool:
-    """Say whether a delay is another one in each episode, or at each step."""
-    return delay is not None and fixed_delay(make_process(delay)) is None
+def is_always(delay: Delay, age: int) -> bool:
+    """Say whether a delay makes all observations amid an episode as old as this."""
+    return age_range(0 if delay is None else delay) == (age, age)
 
 
-def preset_overrides(config: str | Path, preset: str, env_id: str, delay: Delay) -> dict[str, Any]:
+def preset_overrides(
+    config: str | Path, preset: str, env_id: str, delay: Delay, max_delay: int | None = None
+) -> dict[str, Any]:
     """Return what a preset changes for a task: its own entry of ``presets:`` in the file, or the preset's default.
 
     ``cpu`` is what the file says outside ``presets:``, so that rl_zoo3 alone reads it too.
 
-    :param delay: ``planner_by_delay`` is looked up by the largest it can be; where it varies, a preset's planner of one
-        delay (``mask: fixed``) becomes one of all delays
+    :param delay: ``planner_by_delay`` is looked up by the largest it can be
+    :param max_delay: length of the action history, the largest of ``delay`` by default; where observations can be
+        younger, a preset's planner of this one delay (``mask: fixed``) becomes one of all delays
     :raises ValueError: for a preset the file does not have
     """
     if preset == "cpu":
@@ -119,7 +122,8 @@ def preset_overrides(config: str | Path, preset: str, env_id: str, delay: Delay)
     tuned = overrides.pop("planner_by_delay", {}).get(largest_delay(delay))
     if tuned is not None:
         overrides["planner_kwargs"] = {**overrides["planner_kwargs"], "depth": tuned[0], "temperature": tuned[1]}
-    if varies(delay) and overrides.get("planner_kwargs", {}).get("mask") == "fixed":
+    max_delay = largest_delay(delay) if max_delay is None else max_delay
+    if not is_always(delay, max_delay) and overrides.get("planner_kwargs", {}).get("mask") == "fixed":
         overrides["planner_kwargs"] = {**overrides["planner_kwargs"], "mask": "random"}
     return overrides
 
@@ -174,7 +178,7 @@ class DelayedExperimentManager(ExperimentManager):
             self.save_path += zoo_kwargs["uuid_str"]
         self.params_path = f"{self.save_path}/{self.env_name}"
 
-        overrides = preset_overrides(self.config, run.preset, env_id, run.delay)
+        overrides = preset_overrides(self.config, run.preset, env_id, run.delay, run.max_delay)
         overrides |= ALGORITHMS[algo][1]
         if run.delay is not None:
             largest = {} if run.expert_delay is None else {"max_delay": run.max_delay}
@@ -183,10 +187,18 @@ class DelayedExperimentManager(ExperimentManager):
             raise ValueError("--expert-delay sets the wrapper itself; leave env_wrapper out of -params.")
         self.custom_hyperparams = {**overrides, **(self.custom_hyperparams or {})}
         planner_kwargs = self.custom_hyperparams.get("planner_kwargs")
-        if varies(run.delay) and isinstance(planner_kwargs, dict) and planner_kwargs.get("mask") == "fixed":
+        is_fixed = isinstance(planner_kwargs, dict) and planner_kwargs.get("mask") == "fixed"
+        if is_fixed and not is_always(run.delay, run.max_delay):
             raise ValueError(
-                f"A planner with mask='fixed' serves one delay, got --delay {run.delay}; leave mask out of -params."
+                f"A planner with mask='fixed' serves the largest delay alone, here {run.max_delay}, got --delay "
+                f"{run.delay}; leave mask out of -params."
             )
+
+    def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
+        with warnings.catch_warnings():
+            if self.run.expert_delay is not None:  # the planner is not for the environment that the expert learns in
+                warnings.filterwarnings("ignore", "A planner with mask='fixed'", UserWarning)
+            return super().setup_experiment()
 
     def create_envs(self, *args: Any, **kwargs: Any) -> VecEnv:
         """Make environments of the expert's delay, in training as in the evaluations beside it.

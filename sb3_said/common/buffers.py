@@ -134,8 +134,10 @@ class DelayedReplayBuffer(ReplayBuffer):
         self.steps[row] = np.where(continues, self.steps[previous] + 1, 0)
         self.ages[row] = obs["delay"].reshape(self.n_envs) if self.is_delayed else 0
         sent = next_obs["action_history"][:, -1] if self.max_delay > 0 else action
-        sent = sent.reshape(self.n_envs, self.action_dim)
-        self.actions[row] = np.stack([info.get(EXECUTED, newest) for info, newest in zip(infos, sent, strict=True)])
+        self.actions[row] = sent.reshape(self.n_envs, self.action_dim)
+        if self.is_delayed:  # else the name is the task's own
+            for i, info in enumerate(infos):
+                self.actions[row, i] = info.get(EXECUTED, self.actions[row, i])
         self.rewards[row] = reward
         self.dones[row] = done
         if self.handle_timeout_termination:

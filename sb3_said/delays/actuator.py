@@ -20,8 +20,8 @@ class Actuator:
 
     def __init__(self, receiver: NewestPacket, memory: int):
         self.receiver = receiver
-        self._sent: deque[np.ndarray] = deque(maxlen=receiver.process.max_delay + 1)
-        self._ages: deque[int] = deque(maxlen=memory + 1)  # of what was executed in the newest steps
+        self._sent: deque[np.ndarray] = deque(maxlen=int(receiver.process.max_delay) + 1)
+        self._ages: deque[int] = deque(maxlen=int(memory) + 1)  # of what was executed in the newest steps
 
     def reset(self, rng: np.random.Generator) -> None:
         """Start an episode.

@@ -10,11 +10,12 @@ import numpy as np
 
 from sb3_said.delays.processes import (
     DelayProcess,
-    EpisodeDelay,
-    FixedDelay,
+    age_range,
+    as_int,
     check_count,
     check_draw,
     check_probability,
+    checked,
     make_process,
     packet_delays,
 )
@@ -27,7 +28,7 @@ class HeldDelay:
     ``HeldDelay(UniformDelay(min_lag, max_lag), hold_prob, update_period)`` draws as the delay buffers of Isaac Lab and
     mjlab do (there ``update_period=0`` says every step, and the lag is 0 until the first update).
 
-    :param process: draws a new delay when one is due
+    :param process: draws a new delay when one is due; one that draws a delay for an episode does so each time
     :param hold_prob: probability to keep the last delay when a new one is due
     :param update_period: a new delay is due every so many packets; the phase is drawn at every reset
     :raises ValueError: for a probability outside 0..1 or a period below 1
@@ -41,19 +42,33 @@ class HeldDelay:
         make_process(self.process)
         check_probability("hold_prob", self.hold_prob)
         check_count("update_period", self.update_period, 1)
+        as_int(self, "update_period")
+
+    @property
+    def min_delay(self) -> int:
+        return age_range(self.process)[0]
 
     @property
     def max_delay(self) -> int:
-        return make_process(self.process).max_delay
+        return age_range(self.process)[1]
 
     def sample(self, rng: np.random.Generator) -> Iterator[int | None]:
-        delays = packet_delays(make_process(self.process), rng)
+        delays = self._draws(rng)
         phase = int(rng.integers(self.update_period))
         delay = next(delays)
         for packet in itertools.count(1):
             yield delay
             if (packet + phase) % self.update_period == 0 and rng.random() >= self.hold_prob:
                 delay = next(delays)
+
+    def _draws(self, rng: np.random.Generator) -> Iterator[int | None]:
+        process = make_process(self.process)
+        while True:  # what draws without an end never comes back here
+            drawn = process.sample(rng)
+            if isinstance(drawn, Iterator):
+                yield from checked(process, drawn)
+            else:
+                yield check_draw(drawn, process, process.max_delay)
 
 
 @dataclass(frozen=True)
@@ -73,10 +88,15 @@ class PeriodicPackets:
     def __post_init__(self) -> None:
         make_process(self.process)
         check_count("period", self.period, 1)
+        as_int(self, "period")
+
+    @property
+    def min_delay(self) -> int:
+        return age_range(self.process)[0]
 
     @property
     def max_delay(self) -> int:
-        return make_process(self.process).max_delay + self.period - 1
+        return age_range(self.process)[1] + self.period - 1
 
     def sample(self, rng: np.random.Generator) -> Iterator[int | None]:
         for delay in packet_delays(make_process(self.process), rng):
@@ -108,10 +128,15 @@ class DroppedPackets:
         make_process(self.process)
         check_probability("p", self.p)
         check_count("max_losses", self.max_losses, 1)
+        as_int(self, "max_losses")
+
+    @property
+    def min_delay(self) -> int:
+        return age_range(self.process)[0]
 
     @property
     def max_delay(self) -> int:
-        return make_process(self.process).max_delay + self.max_losses
+        return age_range(self.process)[1] + self.max_losses
 
     def sample(self, rng: np.random.Generator) -> Iterator[int | None]:
         for delay in packet_delays(make_process(self.process), rng):
@@ -137,8 +162,12 @@ class TotalDelay:
         make_process(self.observation), make_process(self.action)
 
     @property
+    def min_delay(self) -> int:
+        return age_range(self.observation)[0] + age_range(self.action)[0]
+
+    @property
     def max_delay(self) -> int:
-        return make_process(self.observation).max_delay + make_process(self.action).max_delay
+        return age_range(self.observation)[1] + age_range(self.action)[1]
 
     @property
     def action_varies(self) -> bool:
@@ -159,14 +188,3 @@ class TotalDelay:
             )
         k = check_draw(added, action, action.max_delay)
         return (None if delay is None else delay + k for delay in packet_delays(observation, rng))
-
-
-def fixed_delay(process: int | tuple[int, int] | DelayProcess) -> int | None:
-    """Return the delay of a process that has the same one in every episode; None for others, and for a user's own."""
-    process = make_process(process)
-    if isinstance(process, TotalDelay):
-        parts = fixed_delay(process.observation), fixed_delay(process.action)
-        return None if None in parts else sum(part for part in parts if part is not None)
-    if isinstance(process, (FixedDelay, EpisodeDelay)):
-        return process.max_delay if isinstance(process, FixedDelay) or process.low == process.high else None
-    return None

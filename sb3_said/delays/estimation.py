@@ -10,6 +10,8 @@ import numpy as np
 N_FOLDS = 5  # of the held-out predictions
 MAX_BLOCKS = 100  # consecutive rows that are held out, and resampled, together
 ROWS_PER_FEATURE = 4  # fewer say nothing, held out
+MIN_ROWS = 50  # fewer make too few blocks to resample: unrelated data could look certain
+ROUNDING = 1e-8  # a channel that moves by less of its size than this stands still
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ def estimate_delay(
     :param n_resamples: resampled logs, for the confidence
     :param seed: of the resampling
     :raises ValueError: for arrays that do not fit together or are not finite, observations or actions that never
-        change, or too little data
+        change by more than rounding, or too little data
 
     >>> rng = np.random.default_rng(0)
     >>> states, actions = np.zeros((501, 1)), rng.normal(size=(500, 1))
@@ -66,13 +68,17 @@ def estimate_delay(
     if not (isinstance(max_delay, (int, np.integer)) and max_delay >= 0 and n_resamples >= 1):
         raise ValueError(f"max_delay is >= 0 and n_resamples >= 1, got {max_delay} and {n_resamples}.")
     _check_episodes(observations, actions)
+    observations, actions = ([np.asarray(x, np.float64) for x in log] for log in (observations, actions))
     before, change, lagged = _rows(observations, actions, max_delay)
     n_rows, n_features = before.shape[0], before.shape[1] + lagged.shape[2]
-    if n_rows < ROWS_PER_FEATURE * n_features:
+    needed = max(MIN_ROWS, ROWS_PER_FEATURE * n_features)
+    if n_rows < needed:
         raise ValueError(
-            f"Too little data: {n_rows} steps brought a new observation, at least {ROWS_PER_FEATURE * n_features} are "
+            f"Too little data: {n_rows} steps brought a new observation, at least {needed} are "
             f"needed for {change.shape[1]} observation and {lagged.shape[2]} action entries that vary."
         )
+    if change.shape[1] == 0:
+        raise ValueError("The observations change by the same at every step, which tells nothing of the actions.")
     block = np.arange(n_rows) * min(MAX_BLOCKS, n_rows // 5) // n_rows  # (N,)
     gains = _held_out_gains(before, change, lagged, block % N_FOLDS)  # (N, max_delay + 1)
     of_blocks = np.stack([np.bincount(block, gain) for gain in gains.T], axis=1)  # (n_blocks, max_delay + 1)
@@ -93,29 +99,35 @@ def _rows(
     brought a new observation: (N, features), (N, obs_dim), (max_delay + 1, N, act_dim). Actions before the episode are
     the mean action."""
     before, change, lagged = [], [], []
-    action_mean = np.concatenate([np.asarray(a, np.float64) for a in actions]).mean(0)
-    for episode, sent in zip(observations, actions, strict=True):
-        o = np.asarray(episode, np.float64)  # (T + 1, obs_dim)
+    all_sent = np.concatenate(actions)
+    for o, sent in zip(observations, actions, strict=True):  # (T + 1, obs_dim), (T, act_dim)
         step = np.diff(o, axis=0)  # (T, obs_dim)
         t = 1 + np.flatnonzero(np.any(step[1:] != 0, axis=1))
         before.append(np.hstack([o[t], step[t - 1]]))
         change.append(step[t])
-        a = np.concatenate([np.zeros((max_delay, sent.shape[1])), np.asarray(sent, np.float64) - action_mean])
+        a = np.concatenate([np.zeros((max_delay, sent.shape[1])), sent - all_sent.mean(0)])
         lagged.append(a[max_delay + t - np.arange(max_delay + 1)[:, None]])  # (max_delay + 1, n, act_dim)
-    x, y = _standardise(np.concatenate(before)), _standardise(np.concatenate(change))
+    size = np.abs(np.concatenate(observations)).max(0)  # (obs_dim,)
+    x, y = _standardise(np.concatenate(before), np.tile(size, 2)), _standardise(np.concatenate(change), size)
     a = np.concatenate(lagged, axis=1)
-    scale = np.concatenate([np.asarray(sent, np.float64) for sent in actions]).std(0)
-    varies = scale > 1e-8
-    return np.hstack([x, np.ones((len(x), 1))]), y, a[..., varies] / scale[varies]
+    varies = _varies(all_sent)
+    return np.hstack([x, np.ones((len(x), 1))]), y, a[..., varies] / all_sent.std(0)[varies]
 
 
-def _standardise(x: np.ndarray) -> np.ndarray:
-    """Return the columns that vary as z-scores, clipped where a contact or a fall makes them huge: (N, <= dim)."""
+def _standardise(x: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Return the columns that vary as z-scores, clipped where a contact or a fall makes them huge: (N, <= dim).
+
+    :param size: (dim,) of the observations, whose rounding is in their changes
+    """
     if len(x) == 0:
         return x
-    scale = x.std(0)
-    varies = scale > 1e-8
-    return np.clip((x[:, varies] - x[:, varies].mean(0)) / scale[varies], -4.0, 4.0)
+    x = x[:, x.std(0) > ROUNDING * size]
+    return np.clip((x - x.mean(0)) / x.std(0), -4.0, 4.0)
+
+
+def _varies(x: np.ndarray) -> np.ndarray:
+    """Tell which columns vary by more than rounding: (dim,)."""
+    return x.std(0) > ROUNDING * np.abs(x).max(0, initial=0.0)
 
 
 def _held_out_gains(x: np.ndarray, y: np.ndarray, lagged: np.ndarray, fold: np.ndarray) -> np.ndarray:
@@ -156,7 +168,8 @@ def _check_episodes(observations: Sequence[np.ndarray], actions: Sequence[np.nda
             )
         if not (np.all(np.isfinite(o)) and np.all(np.isfinite(a))):
             raise ValueError(f"Episode {i} has observations or actions that are not finite.")
-    if np.all(np.concatenate(actions).std(0) <= 1e-8):
+    if not _varies(np.concatenate(actions)).any():
         raise ValueError("The actions never change; log the system while it is given different actions.")
-    if not any(np.any(np.diff(o, axis=0)) for o in observations):
+    size = np.abs(np.concatenate(observations)).max(0)  # (obs_dim,)
+    if not any(np.any(np.abs(np.diff(o, axis=0)) > ROUNDING * size) for o in observations):
         raise ValueError("The observations never change: none arrived, or the log is of another system.")

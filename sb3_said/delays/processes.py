@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import bisect
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -16,7 +16,10 @@ import numpy as np
 
 
 class DelayProcess(Protocol):
-    """Draws how many control steps the packets of an episode take."""
+    """Draws how many control steps the packets of an episode take.
+
+    A ``min_delay`` beside ``max_delay``, the smallest age amid an episode, is optional: see :func:`age_range`.
+    """
 
     @property
     def max_delay(self) -> int:
@@ -43,6 +46,11 @@ class FixedDelay:
     def __post_init__(self) -> None:
         if not (_is_integer(self.delay) and self.delay >= 0):
             raise ValueError(f"A delay is a whole number of control steps >= 0, got {self.delay}.")
+        as_int(self, "delay")
+
+    @property
+    def min_delay(self) -> int:
+        return self.delay
 
     @property
     def max_delay(self) -> int:
@@ -64,6 +72,11 @@ class _Range:
             raise ValueError(
                 f"A delay range is (low, high), whole numbers with 0 <= low <= high, got ({self.low}, {self.high})."
             )
+        as_int(self, "low", "high")
+
+    @property
+    def min_delay(self) -> int:
+        return self.low
 
     @property
     def max_delay(self) -> int:
@@ -119,18 +132,23 @@ class DistributionDelay:
         object.__setattr__(self, "probabilities", tuple(p.tolist()))  # a list (from YAML) has no hash
 
     @classmethod
-    def from_samples(cls, delays: Iterable[int]) -> DistributionDelay:
+    def from_samples(cls, delays: Sequence[int] | np.ndarray) -> DistributionDelay:
         """Take the distribution of measured delays, in control steps (see ``in_steps``).
 
-        :raises ValueError: for no, negative or fractional delays
+        :param delays: (n,)
+        :raises ValueError: for no, negative or fractional delays, or an array of another shape
         """
-        drawn = np.asarray(list(delays))
-        if drawn.size == 0 or not np.issubdtype(drawn.dtype, np.integer) or drawn.min() < 0:
+        drawn = np.asarray(delays)
+        if drawn.ndim != 1 or drawn.size == 0 or not np.issubdtype(drawn.dtype, np.integer) or drawn.min() < 0:
             raise ValueError(
-                f"Measured delays are whole numbers of control steps >= 0, got {drawn}; "
+                f"Measured delays are a list of whole numbers of control steps >= 0, got {drawn}; "
                 "in_steps(milliseconds, control_period) makes them."
             )
         return cls(tuple(np.bincount(drawn) / len(drawn)))
+
+    @property
+    def min_delay(self) -> int:
+        return int(np.flatnonzero(self.probabilities)[0])
 
     @property
     def max_delay(self) -> int:
@@ -217,6 +235,15 @@ def make_process(delay: int | Sequence[int] | str | DelayProcess) -> DelayProces
     )
 
 
+def age_range(process: int | Sequence[int] | str | DelayProcess) -> tuple[int, int]:
+    """Return the smallest and the largest age that a process brings amid an episode, in control steps.
+
+    An episode's start has smaller ones. A user's own process without ``min_delay`` may bring any up to ``max_delay``.
+    """
+    process = make_process(process)
+    return getattr(process, "min_delay", 0), process.max_delay
+
+
 def packet_delays(process: DelayProcess, rng: np.random.Generator) -> Iterator[int | None]:
     """Draw an episode from a process: the delays of the packets sent at steps 1, 2, ...; None for one that is lost.
 
@@ -224,11 +251,15 @@ def packet_delays(process: DelayProcess, rng: np.random.Generator) -> Iterator[i
     """
     drawn = process.sample(rng)
     if isinstance(drawn, Iterator):
-        return _checked(process, drawn)
+        return checked(process, drawn)
     return itertools.repeat(check_draw(drawn, process, process.max_delay))
 
 
-def _checked(process: DelayProcess, delays: Iterator[int | None]) -> Iterator[int | None]:
+def checked(process: DelayProcess, delays: Iterator[int | None]) -> Iterator[int | None]:
+    """Yield the delays that a process draws for an episode.
+
+    :raises ValueError: on the way, for anything but integers in 0..max_delay, or when they end
+    """
     max_delay = process.max_delay
     for delay in delays:
         yield None if delay is None else check_draw(delay, process, max_delay)
@@ -261,6 +292,12 @@ def check_count(name: str, n: int, smallest: int) -> None:
     """
     if not (_is_integer(n) and n >= smallest):
         raise ValueError(f"{name} is a whole number >= {smallest}, got {n}.")
+
+
+def as_int(process: object, *names: str) -> None:
+    """Make whole numbers of NumPy, which ``in_steps`` returns, Python's own, in an immutable process."""
+    for name in names:
+        object.__setattr__(process, name, int(getattr(process, name)))
 
 
 def _is_integer(x: object) -> bool:

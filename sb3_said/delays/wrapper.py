@@ -11,7 +11,7 @@ from gymnasium import spaces
 
 from sb3_said.delays.actuator import Actuator
 from sb3_said.delays.combined import TotalDelay
-from sb3_said.delays.processes import DelayProcess, check_count, make_process
+from sb3_said.delays.processes import DelayProcess, age_range, check_count, make_process
 from sb3_said.delays.receivers import RECEIVERS
 
 #: Keeps the delays' random numbers apart from those that the task draws from the same seed.
@@ -57,8 +57,10 @@ class DelayedObservationWrapper(
     :param receiver: ``"newest"`` keeps the newest packet that has arrived; ``"independent"`` reads an age drawn anew at
         every step (paper, section 2); of observations, and of actions that take a time each
     :param state_history: see above; under ``"independent"`` states younger than ``observation`` may be known, under
-        ``"newest"`` none are
-    :raises ValueError: for other spaces, a bad delay, an unknown receiver, or a ``max_delay`` below the largest delay
+        ``"newest"`` none are. Not where every action takes a time of its own: rows of sent actions are no steps of the
+        task there
+    :raises ValueError: for other spaces, a bad delay, an unknown receiver, a ``max_delay`` below the largest delay, or
+        a ``state_history`` where every action takes a time of its own
 
     >>> env = DelayedObservationWrapper(gym.make("Pendulum-v1"), delay=2)
     >>> obs, info = env.reset(seed=0)
@@ -109,14 +111,21 @@ class DelayedObservationWrapper(
         self.process = (
             make_process(delay) if action_delay == 0 else TotalDelay(make_process(delay), make_process(action_delay))
         )
-        self.max_delay = self.process.max_delay if max_delay is None else max_delay
-        check_count("max_delay", self.max_delay, 0)
+        largest = self.process.max_delay if max_delay is None else max_delay
+        check_count("max_delay", largest, 0)
+        self.max_delay = int(largest)
         if self.max_delay < self.process.max_delay:
             raise ValueError(f"max_delay={max_delay} is smaller than the largest delay {self.process.max_delay}.")
         if receiver not in RECEIVERS:
             raise ValueError(f"receiver is {receiver!r}, expected one of {tuple(RECEIVERS)}.")
         observed, self.actuator = self.process, None
         if isinstance(self.process, TotalDelay) and self.process.action_varies:
+            if state_history:
+                raise ValueError(
+                    f"Under {self.process.action} every action takes a time of its own, so that what was sent between "
+                    "two states is not what was executed; leave state_history=False, or give an action delay that "
+                    "stays for an episode."
+                )
             observed = make_process(self.process.observation)
             self.actuator = Actuator(RECEIVERS[receiver](make_process(self.process.action)), observed.max_delay)
         self.receiver = RECEIVERS[receiver](observed)
@@ -143,6 +152,11 @@ class DelayedObservationWrapper(
         self._received = np.zeros((self.max_delay + 1, *obs_space.shape), np.float32)  # s_{t-D..t}, zeros where unknown
         self._is_received = np.zeros(self.max_delay + 1, np.float32)
 
+    @property
+    def age_range(self) -> tuple[int, int]:
+        """The smallest and the largest ``delay`` amid an episode; numbers, for workers of vectorised environments."""
+        return age_range(self.process)
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -160,7 +174,7 @@ class DelayedObservationWrapper(
         self.receiver.reset(self._rng)
         self._states.clear()
         self._history[:] = self._received[:] = self._is_received[:] = 0.0
-        return self._observe(state, age=0, lag=0), self._with_state(info)
+        return self._observe(state, age=0), self._with_own(info)
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict[str, Any]]:
         """Send the action; observe what has arrived.
@@ -174,13 +188,13 @@ class DelayedObservationWrapper(
         if self.max_delay > 0:
             self._history[:-1] = self._history[1:]
             self._history[-1] = self._scale(action)
-        age, lag = self.receiver.step(), 0
-        if self.actuator is not None:
-            lag = self.actuator.lag(age)
-            info = {**info, "executed_action": self._scale(executed)}
-        return self._observe(state, age, lag), reward, terminated, truncated, self._with_state(info)
+        age = self.receiver.step()
+        if self.actuator is None:
+            return self._observe(state, age), reward, terminated, truncated, self._with_own(info)
+        obs = self._observe(state, age, self.actuator.lag(age))
+        return obs, reward, terminated, truncated, self._with_own(info, executed_action=self._scale(executed))
 
-    def _observe(self, state: np.ndarray, age: int, lag: int) -> dict[str, np.ndarray]:
+    def _observe(self, state: np.ndarray, age: int, lag: int = 0) -> dict[str, np.ndarray]:
         """Hand out the state of an age that is behind by ``lag`` actions more."""
         self._states.append(np.asarray(state, dtype=np.float32).copy())
         obs = {
@@ -188,26 +202,24 @@ class DelayedObservationWrapper(
             "action_history": self._history.copy(),
             "delay": np.array([age + lag], dtype=np.float32),
         }
-        return obs | self._remember(obs["observation"], age, lag) if self.state_history else obs
+        return obs | self._remember(obs["observation"], age) if self.state_history else obs
 
-    def _remember(self, observation: np.ndarray, age: int, lag: int) -> dict[str, np.ndarray]:
+    def _remember(self, observation: np.ndarray, age: int) -> dict[str, np.ndarray]:
         """Return all that was handed out, this observation included, in the rows of the actions that led there."""
         for rows in (self._received, self._is_received):
             rows[:-1] = rows[1:]
             rows[-1] = 0.0
         self._received[-1 - age], self._is_received[-1 - age] = observation, 1.0
-        states, known = np.zeros_like(self._received[1:]), np.zeros_like(self._is_received[1:])
-        states[: self.max_delay - lag], known[: self.max_delay - lag] = (
-            rows[1 + lag :] for rows in (self._received, self._is_received)
-        )
-        return {"state_history": states, "state_known": known}
+        return {"state_history": self._received[1:].copy(), "state_known": self._is_received[1:].copy()}
 
-    def _with_state(self, info: dict[str, Any]) -> dict[str, Any]:
+    def _with_own(self, info: dict[str, Any], **own: np.ndarray) -> dict[str, Any]:
+        """Return the task's info with this wrapper's entries, and without what it has under the same names."""
         return {
-            **info,
+            **{key: value for key, value in info.items() if key != "executed_action"},
             "undelayed_observation": self._states[-1].copy(),
             "forced_deliveries": self.receiver.forced_deliveries
             + (0 if self.actuator is None else self.actuator.receiver.forced_deliveries),
+            **own,
         }
 
     def _scale(self, action: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ import pathlib
 import warnings
 from typing import Any, ClassVar
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
@@ -27,7 +28,6 @@ from sb3_said.common.checks import check_choice
 from sb3_said.common.precision import PRECISIONS, autocast
 from sb3_said.common.save_util import PickleRefusedError, SafeSaveMixin, explained_refusal, load_tree, save_tree
 from sb3_said.common.spaces import check_spaces
-from sb3_said.delays.processes import DelayProcess
 from sb3_said.sac.networks import FusedAdam, StackedCritic
 from sb3_said.sac.policies import DelayedSACPolicy
 
@@ -93,7 +93,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
         if precision == "bfloat16" and sac_kwargs.get("use_sde"):
             raise ValueError('gSDE is computed in float32: give precision="float32" or "auto" with use_sde=True.')
         self.precision = precision
-        self.trained_delay: str | None = None  # what made the delays it has learned from, written out
+        self.trained_ages: list[int] | None = None  # of the observations it has learned from last, amid episodes
         self.augment_state = augment_state
         self.delay_reconciled_critic = delay_reconciled_critic
         self.exchanged_ages = exchanged_ages
@@ -147,7 +147,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
         if obs is not None and not self.replay_buffer.knows_past(obs).all():  # emptied, or not loaded with the agent
             self._last_obs = None  # SB3 then resets the environments
         learn = super()._setup_learn(*args, **kwargs)
-        self.trained_delay = _written(process_of(self.env))
+        self.trained_ages = ages_of(self.env)
         return learn
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
@@ -165,10 +165,10 @@ class DelayedSAC(SafeSaveMixin, SAC):
         return rollout
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """Take another environment, as SB3 does; see :meth:`check_delay` for one with another delay."""
+        """Take another environment, as SB3 does; see :meth:`check_ages` for one with another delay."""
         self._check_spaces(env, self.observation_space, self.action_space)
+        self.check_ages(ages_of(env))
         super().set_env(env, force_reset)
-        self.check_delay(process_of(self.env))
 
     @classmethod
     def _check_spaces(cls, env: GymEnv, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
@@ -182,27 +182,45 @@ class DelayedSAC(SafeSaveMixin, SAC):
 
     def _check_loaded(self) -> None:
         if self.env is not None:
-            self.check_delay(process_of(self.env))
+            self.check_ages(ages_of(self.env))
 
-    def check_delay(self, process: DelayProcess | None) -> None:
-        """Warn where an agent that was trained under one delay is to act under another.
+    def check_ages(self, ages: list[int]) -> None:
+        """Warn where an agent is to act on observations of ages that it has not met in training, amid episodes.
 
-        Ages it has never acted on are not an error, since training can go on with them, but nothing was learned there.
+        They are not an error, since training can go on with them, but nothing was learned there.
 
-        :param process: makes the delays that it will meet; None where nothing is delayed
+        :param ages: that it will meet, in control steps (see :func:`ages_of`)
         """
-        delay = _written(process)
-        if self.trained_delay is None or delay == self.trained_delay or self._serves(process):
+        unmet = [] if self.trained_ages is None else sorted(set(ages) - set(self.trained_ages))
+        if self.trained_ages is None or not unmet or self._serves(ages):
             return
         warnings.warn(
-            f"This {type(self).__name__} learned under {self.trained_delay} and is given {delay}: what it does at ages "
-            "it has not met is undefined. Train it on a range, such as delay=(0, 8), or give it the delay it knows.",
+            f"This {type(self).__name__} learned at ages {written_ages(self.trained_ages)} and is given "
+            f"{written_ages(unmet)}: what it does at ages it has not met is undefined. Train it on a range, such as "
+            "delay=(0, 8), or give it the delay it knows.",
             stacklevel=3,
         )
 
-    def _serves(self, process: DelayProcess | None) -> bool:
-        """Tell whether answers are as good under delays that training did not bring."""
-        return False
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Answer as SB3 does, and warn like :meth:`check_ages` where observations amid an episode have other ages."""
+        answer = super().predict(observation, state, episode_start, deterministic)
+        if isinstance(observation, dict) and self.trained_ages is not None:
+            ages = np.ravel(observation["delay"])  # (B,)
+            if not set(ages.tolist()) <= set(self.trained_ages):
+                # As many actions as the history holds have been sent: no younger age is due to the episode's start.
+                history = np.reshape(observation["action_history"], (len(ages), self.policy.max_delay, -1))
+                DelayedSAC.check_ages(self, sorted({int(age) for age in ages[history[:, 0].any(1)]}))
+        return answer
+
+    def _serves(self, ages: list[int]) -> bool:
+        """Tell whether answers are as good at ages that training did not bring."""
+        return not ages
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Update critics, actor, entropy coefficient and target critics ``gradient_steps`` times, as SAC does."""
@@ -305,16 +323,22 @@ class DelayedSAC(SafeSaveMixin, SAC):
         self.replay_buffer.load_state_dict(state)
 
 
-def process_of(env: VecEnv | None) -> DelayProcess | None:
-    """Return what makes the delays of an environment, None where nothing is delayed."""
+def ages_of(env: GymEnv | None) -> list[int]:
+    """Return the ages that observations can have amid the episodes of an environment, [0] where nothing is delayed.
+
+    :param env: one environment, or several that may have other delays
+    """
     # Asked for first: a missing attribute ends the workers of a SubprocVecEnv. A plain task may have one of its own.
-    if env is None or not isinstance(env.observation_space, spaces.Dict) or not env.has_attr("process"):
-        return None
-    return env.get_attr("process")[0]
+    if env is None or isinstance(env, str) or not isinstance(env.observation_space, spaces.Dict):
+        return [0]
+    if isinstance(env, VecEnv):
+        ranges = env.get_attr("age_range") if env.has_attr("age_range") else [(0, 0)]
+    else:
+        ranges = [env.get_wrapper_attr("age_range") if env.has_wrapper_attr("age_range") else (0, 0)]
+    return sorted({age for low, high in ranges for age in range(low, high + 1)})
 
 
-def _written(process: DelayProcess | None) -> str | None:
-    """Write out a delay process, by its class where it has no repr of its own."""
-    if process is None:
-        return None
-    return type(process).__name__ if type(process).__repr__ is object.__repr__ else repr(process)
+def written_ages(ages: list[int]) -> str:
+    """Write ages as a reader would, ``0..8`` or ``2, 5``."""
+    is_range = len(ages) > 2 and ages == list(range(ages[0], ages[-1] + 1))
+    return f"{ages[0]}..{ages[-1]}" if is_range else ", ".join(map(str, ages))

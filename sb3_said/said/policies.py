@@ -76,6 +76,11 @@ class SAIDPolicy(DelayedSACPolicy):
         """Whether the planner has been trained, and so answers."""
         return bool(self.planner_updates > 0)
 
+    @property
+    def who_answers(self) -> Answer:
+        """Who answers ``predict``."""
+        return self._answer or ("planner" if self.planner_is_trained else "expert")
+
     @contextmanager
     def answering(self, who: Answer) -> Iterator[None]:
         """Let the planner or the expert answer ``predict`` for a while, whichever would otherwise.
@@ -105,7 +110,7 @@ class SAIDPolicy(DelayedSACPolicy):
         return self.critic.q_values(observation, actions.flatten(0, -2)).amin(0).view(states.shape[:-1])
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        who = self._answer or ("planner" if self.planner_is_trained else "expert")
+        who = self.who_answers
         if not deterministic:
             return self._plan(observation) if who == "planner" else super()._predict(observation)
         # Each row alone: matrix products of another batch size round differently, and can change the candidate chosen.

@@ -16,12 +16,10 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import configure_logger
 
 from sb3_said.common.spaces import has_state_history
-from sb3_said.delays.combined import fixed_delay
-from sb3_said.delays.processes import DelayProcess
 from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.sac import DelayedSAC
-from sb3_said.sac.delayed_sac import process_of
+from sb3_said.sac.delayed_sac import ages_of, written_ages
 from sb3_said.said.callbacks import PlannerTrainingCallback
 from sb3_said.said.policies import SAIDPolicy
 
@@ -98,8 +96,8 @@ class SAID(DelayedSAC):
     def _setup_model(self) -> None:
         super()._setup_model()
         self._planner_settings = asdict(self.policy.planner.config)
-        is_new = self.trained_delay is None  # else it was loaded, and check_delay says what must be said
-        if is_new and self.env is not None and (reason := self._why_no_answer(process_of(self.env))):
+        is_new = self.trained_ages is None  # else it was loaded, and check_ages says what must be said
+        if is_new and self.env is not None and (reason := self._why_no_answer(ages_of(self.env))):
             warnings.warn(reason, stacklevel=3)
 
     def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:
@@ -159,28 +157,29 @@ class SAID(DelayedSAC):
         self.planner_kwargs = {**(self.planner_kwargs or {}), **settings}
         self.policy.planner_kwargs = {**self.policy.planner_kwargs, **settings}
 
-    def check_delay(self, process: DelayProcess | None) -> None:
-        """Refuse delays under which the planner, once trained, has no answer; warn where the expert knows none.
+    def check_ages(self, ages: list[int]) -> None:
+        """Refuse ages at which the planner, once trained, has no answer; warn where the expert knows none.
 
-        :param process: makes the delays that it will meet; None where nothing is delayed
-        :raises ValueError: for a planner with ``mask="fixed"``, which answers at age ``max_delay`` only, under others
+        :param ages: that it will meet amid episodes, in control steps
+        :raises ValueError: for a planner with ``mask="fixed"``, which answers at age ``max_delay`` only, at others
         """
-        if self.policy.planner_is_trained and (reason := self._why_no_answer(process)):
+        if self.policy.planner_is_trained and (reason := self._why_no_answer(ages)):
             raise ValueError(reason)
-        super().check_delay(process)
+        super().check_ages(ages)
 
-    def _why_no_answer(self, process: DelayProcess | None) -> str | None:
-        delay, max_delay = 0 if process is None else fixed_delay(process), self.policy.max_delay
-        if self.policy.planner.config.mask == "random" or delay == max_delay:
+    def _why_no_answer(self, ages: list[int]) -> str | None:
+        max_delay = self.policy.max_delay
+        if self.policy.planner.config.mask == "random" or ages == [max_delay]:
             return None
         return (
-            f"A planner with mask='fixed' answers under delay={max_delay} only, but this environment has {process}; "
-            "train one with mask='random', which serves every delay up to the largest."
+            f"A planner with mask='fixed' answers at age {max_delay} only, but this environment has ages "
+            f"{written_ages(ages)}; train one with mask='random', which serves every delay up to the largest."
         )
 
-    def _serves(self, process: DelayProcess | None) -> bool:
+    def _serves(self, ages: list[int]) -> bool:
         # Masks were drawn from all of 0..D, over true states that replay has at every age
-        return self.policy.planner_is_trained and self._why_no_answer(process) is None
+        planned = self.policy.who_answers == "planner" and self._why_no_answer(ages) is None
+        return planned or super()._serves(ages)
 
     def warmup(self, batch_size: int = 1) -> None:
         """Answer a few times for nothing: see :meth:`SAIDPolicy.warmup`. A control loop calls it once before it starts.

@@ -265,6 +265,14 @@ def test_actions_that_take_a_time_each_are_stored_as_they_are_executed(process, 
             np.testing.assert_array_equal(batch["observations/action_history"][i, -k], executed[tag - k])
 
 
+def test_the_info_of_a_task_without_the_wrapper_is_its_own():
+    space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+    buffer = DelayedReplayBuffer(4, space, space)
+    obs, action = np.zeros((1, 2), np.float32), np.full((1, 2), 0.5, np.float32)
+    buffer.add(obs, obs, action, np.zeros(1), np.zeros(1), [{"executed_action": np.array([7.0, 8.0])}])
+    np.testing.assert_array_equal(buffer.actions[0], action)
+
+
 def test_delay_zero_has_empty_histories():
     player = Player(delay=0)
     rows = player.play(50)

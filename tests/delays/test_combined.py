@@ -6,11 +6,21 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from logged_task import LoggedTask
 from random_processes import N, draw_packets, frequencies, processes
 
-from sb3_said.delays import DroppedPackets, FixedDelay, HeldDelay, PeriodicPackets, TotalDelay, UniformDelay
-from sb3_said.delays.combined import fixed_delay
-from sb3_said.delays.processes import packet_delays
+from sb3_said.delays import (
+    WIFI_20MS,
+    DelayedObservationWrapper,
+    DroppedPackets,
+    FixedDelay,
+    HeldDelay,
+    PeriodicPackets,
+    TotalDelay,
+    UniformDelay,
+)
+from sb3_said.delays.processes import age_range, packet_delays
+from sb3_said.delays.receivers import RECEIVERS
 
 
 @pytest.mark.parametrize("inner", [-1, (4, 2), 1.5, None])
@@ -102,13 +112,26 @@ def test_observations_take_as_long_with_action_delay_as_without(process, low, sp
     assert TotalDelay(process, (low, low + spread)).max_delay == process.max_delay + low + spread
 
 
+def test_held_delay_draws_an_episodes_delay_anew():
+    delays = draw_packets(HeldDelay((0, 3), hold_prob=0.5), N)
+    np.testing.assert_allclose(frequencies(delays, 4), 0.25, atol=0.03)
+    assert set(draw_packets(HeldDelay(2, hold_prob=0.5), 50).tolist()) == {2}
+
+
 @settings(deadline=None)
-@given(processes(), processes(), st.integers(0, 2**16))
-def test_a_fixed_delay_is_that_of_every_packet(observation, action, seed):
-    for process in (observation, TotalDelay(observation, action)):
-        delay = fixed_delay(process)
-        if delay is not None:
-            assert set(draw_packets(process, 30, seed).tolist()) == {delay}
-    for process in (3, (3, 3), TotalDelay(1, (2, 2))):
-        assert fixed_delay(process) == 3
-    assert fixed_delay((2, 3)) is None and fixed_delay(TotalDelay(1, (2, 3))) is None
+@given(processes(), processes(), st.sampled_from(sorted(RECEIVERS)), st.integers(0, 2**16))
+def test_ages_are_in_the_range_that_a_process_says(observation, action, receiver, seed):
+    env = DelayedObservationWrapper(LoggedTask(length=60), observation, action, receiver=receiver)
+    low, high = env.age_range
+    assert (low, high) == age_range(TotalDelay(observation, action))
+    env.reset(seed=seed)
+    ages = [env.step(env.action_space.sample())[0]["delay"].item() for _ in range(60)]
+    assert low <= min(ages[env.max_delay :]) and max(ages) <= high
+
+
+def test_the_range_of_ages():
+    for process in (3, (3, 3), TotalDelay(1, (2, 2)), "HeldDelay(3)", UniformDelay(3, 3)):
+        assert age_range(process) == (3, 3)
+    assert age_range((2, 3)) == (2, 3)
+    assert age_range(TotalDelay(1, WIFI_20MS)) == (2, 7)
+    assert age_range(DroppedPackets(PeriodicPackets(2, period=5), p=0.1)) == (2, 10)

@@ -151,6 +151,13 @@ def test_actions_of_no_effect_give_no_confidence():
     assert np.median(confidences) < 0.5 and max(confidences) < 0.95
 
 
+def test_short_logs_of_unrelated_data_are_not_certain():
+    rng = np.random.default_rng(0)
+    logs = [(rng.normal(size=(54, 1)), rng.normal(size=(53, 1))) for _ in range(60)]
+    certain = [estimate_delay([states], [actions]).confidence >= 0.95 for states, actions in logs]
+    assert np.mean(certain) <= 0.05
+
+
 def test_a_delay_beyond_those_tried_gives_no_confidence():
     observations, actions, _ = delayed(linear_episodes(20), FixedDelay(6))
     assert estimate_delay(observations, actions, max_delay=5).confidence < 0.95
@@ -164,6 +171,8 @@ def test_repeats_and_does_not_depend_on_units():
     np.testing.assert_array_equal(first.scores, again.scores)
     scaled = estimate_delay([1e-3 * o + 5 for o in observations], [1e3 * a - 7 for a in actions])
     np.testing.assert_allclose(scaled.scores, first.scores, atol=1e-6)
+    tiny = estimate_delay([(1e-12 * o).tolist() for o in observations], [(1e-12 * a).tolist() for a in actions])
+    np.testing.assert_allclose(tiny.scores, first.scores, atol=1e-6)
 
 
 def test_entries_that_never_vary_are_left_out():
@@ -189,7 +198,11 @@ STATES, ACTIONS = linear_episodes(1, 200)[0]
         ([STATES, np.full_like(STATES, np.nan)], [ACTIONS, ACTIONS], "Episode 1 .* not finite"),
         ([STATES], [np.full_like(ACTIONS, 0.3)], "actions never change"),
         ([np.ones_like(STATES)], [ACTIONS], "observations never change"),
-        ([STATES[:31]], [ACTIONS[:30]], "Too little data: 29 steps brought a new observation, at least 36 are needed"),
+        ([STATES[:51]], [ACTIONS[:50]], "Too little data: 49 steps brought a new observation, at least 50 are needed"),
+        ([np.tile(STATES[:51], 3)], [ACTIONS[:50]], "49 steps brought a new observation, at least 84 are needed"),
+        ([np.arange(201.0)[:, None]], [ACTIONS], "change by the same at every step"),
+        ([5 + 1e-12 * STATES], [ACTIONS], "observations never change"),
+        ([STATES], [5 + 1e-12 * ACTIONS], "actions never change"),
         ([STATES[:2]] * 50, list(ACTIONS[:50, None]), "Too little data: 0 steps"),
     ],
 )

@@ -11,8 +11,11 @@ from sb3_said.delays import (
     WIFI_20MS,
     DelayedObservationWrapper,
     DistributionDelay,
+    DroppedPackets,
     EpisodeDelay,
     FixedDelay,
+    HeldDelay,
+    PeriodicPackets,
     RandomWalkDelay,
     UniformDelay,
     in_steps,
@@ -39,6 +42,21 @@ def test_what_a_user_may_write(written, process):
     assert make_process(written) == process
 
 
+def test_whole_numbers_of_numpy_are_numbers():
+    """``in_steps`` returns them for an array."""
+    low, high = in_steps(np.array([20.0, 160.0]), 20)
+    for process, expected in [
+        (UniformDelay(low, high), "UniformDelay(low=1, high=8)"),
+        (FixedDelay(high), "FixedDelay(delay=8)"),
+        (PeriodicPackets(2, high), "PeriodicPackets(process=2, period=8)"),
+        (DroppedPackets(2, 0.1, max_losses=high), "DroppedPackets(process=2, p=0.1, max_losses=8)"),
+        (HeldDelay(2, update_period=high), "HeldDelay(process=2, hold_prob=0.0, update_period=8)"),
+    ]:
+        assert repr(process) == expected and make_process(expected) == process
+        for kwargs in ({"delay": process}, {"delay": 0, "action_delay": process}, {"delay": 0, "max_delay": high}):
+            DelayedObservationWrapper(LoggedTask(), **kwargs).reset(seed=0)
+
+
 @pytest.mark.parametrize("written", [-1, (-1, 2), (4, 2), 1.5, (0, 2.5), (1, 2, 3), True, (False, True), None, "4.5"])
 def test_what_is_refused(written):
     with pytest.raises(ValueError, match=r"delay"):
@@ -58,6 +76,8 @@ def test_what_is_refused(written):
         (lambda: DistributionDelay(()), "add up to 1"),
         (lambda: DistributionDelay((float("nan"), 1.0)), "add up to 1"),
         (lambda: DistributionDelay.from_samples([]), "whole numbers"),
+        (lambda: DistributionDelay.from_samples(in_steps(70, 20)), "a list of whole numbers .* got 4"),
+        (lambda: DistributionDelay.from_samples(np.ones((2, 2), int)), "a list of whole numbers"),
         (lambda: DistributionDelay.from_samples([0, -1]), "whole numbers"),
         (lambda: DistributionDelay.from_samples([12.5, 31.0]), "in_steps"),
     ],

@@ -20,11 +20,12 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.save_util import save_to_pkl
 from stable_baselines3.common.torch_layers import CombinedExtractor
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.common.buffers import UNDELAYED
 from sb3_said.common.precision import has_bfloat16
+from sb3_said.delays import TotalDelay, UniformDelay
 
 AUGMENTED = {"observation", "action_history", "delay"}
 
@@ -211,47 +212,79 @@ def test_both_policy_names_are_the_same_policy(env):
     assert_same_parameters(*models)
 
 
-def test_another_delay_than_it_learned_under_is_never_taken_silently(tmp_path):
+def test_ages_that_it_has_not_met_are_never_taken_silently(tmp_path):
     model = make(delayed(2))
     model.set_env(delayed((0, 2)))  # has learned nothing yet
-    assert model.trained_delay is None
+    assert model.trained_ages is None
     model.learn(30)
-    assert model.trained_delay == "EpisodeDelay(low=0, high=2)"
+    assert model.trained_ages == [0, 1, 2]
     model.save(tmp_path / "agent")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        model.set_env(delayed((0, 2)))
+        for env in (delayed((0, 2)), delayed(UniformDelay(0, 2)), delayed(1, max_delay=2), delayed(TotalDelay(1, 1))):
+            model.set_env(env)
+            DelayedSAC.load(tmp_path / "agent", env=env)
         DelayedSAC.load(tmp_path / "agent")
-        DelayedSAC.load(tmp_path / "agent", env=delayed((0, 2)))
         make(Drift()).learn(30).set_env(Drift())
-    another = r"DelayedSAC learned under EpisodeDelay\(low=0, high=2\) and is given FixedDelay\(delay=2\)"
+    model = make(delayed(1, max_delay=2)).learn(30)
+    model.save(tmp_path / "agent")
+    another = r"DelayedSAC learned at ages 1 and is given 0, 2:"
     with pytest.warns(UserWarning, match=another):
-        model.set_env(delayed(2))
+        model.set_env(delayed((0, 2)))
     with pytest.warns(UserWarning, match=another):
-        loaded = DelayedSAC.load(tmp_path / "agent", env=delayed(2))
-    loaded.learn(30)  # goes on under the new delay, and knows it from then on
-    assert loaded.trained_delay == "FixedDelay(delay=2)"
+        loaded = DelayedSAC.load(tmp_path / "agent", env=delayed(UniformDelay(0, 2)))
+    loaded.learn(30)  # goes on under the new delays, and knows them from then on
+    assert loaded.trained_ages == [0, 1, 2]
     with pytest.raises(ValueError, match="built for max_delay=2, but this environment has max_delay=3"):
         model.set_env(delayed(3))
+    assert model.env.get_attr("max_delay") == [2]  # what is refused is not taken
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_each_of_several_environments_has_ages_of_its_own(first):
+    envs = [lambda: delayed(1, max_delay=2), lambda: delayed(2)]
+    model = make(DummyVecEnv(envs[:1] * 2)).learn(30)
+    with pytest.warns(UserWarning, match="learned at ages 1 and is given 2:"):
+        model.set_env(DummyVecEnv([envs[first], envs[1 - first]]))
+
+
+@pytest.mark.parametrize("n", [None, 1, 3])
+def test_ages_that_it_has_not_met_are_noticed_in_its_observations(n):
+    """``evaluate_policy`` and a robot's control loop hand over no environment to be checked."""
+    model = make(delayed(1, max_delay=2)).learn(30)
+    history = np.full((2, 1), 0.5, np.float32)
+    obs = {"observation": np.zeros(2, np.float32), "action_history": history, "delay": np.ones(1, np.float32)}
+    start = {**obs, "action_history": np.array([[0.0], [0.5]], np.float32), "delay": np.zeros(1, np.float32)}
+    rows = [obs, start] if n is None else [obs] * (n - 1) + [start]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for row in rows:
+            model.predict(row)  # younger than ever amid an episode, but two actions have not been sent yet
+    late = {**obs, "delay": np.full(1, 2, np.float32)}
+    batch = late if n is None else {key: np.stack([row[key] for row in (*rows, late)]) for key in obs}
+    with pytest.warns(UserWarning, match="learned at ages 1 and is given 2: what it does"):
+        model.predict(batch)
 
 
 class OwnDelay:
-    """A user's own process, without a repr."""
+    """A user's own process, which a worker cannot be sent: its class is not where pickle looks for it."""
 
+    __module__ = "nowhere"
     max_delay = 2
 
     def sample(self, rng):
         return int(rng.integers(3))
 
 
-def test_own_delays_are_told_apart_by_their_class():
-    model = make(delayed(OwnDelay())).learn(30)
-    assert model.trained_delay == "OwnDelay"
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        model.check_delay(OwnDelay())
-    with pytest.warns(UserWarning, match=r"learned under OwnDelay and is given None"):
-        model.check_delay(None)
+class LateDelay(OwnDelay):
+    min_delay = 1
+
+
+def test_own_delays_may_say_their_smallest():
+    model = make(delayed(LateDelay())).learn(30)
+    assert model.trained_ages == [1, 2]
+    with pytest.warns(UserWarning, match=r"learned at ages 1, 2 and is given 0:"):
+        model.set_env(delayed(OwnDelay()))
 
 
 def test_precision_is_what_was_asked_for():
@@ -325,11 +358,15 @@ class Simulator(Drift):
     process = "a program"
 
 
-@pytest.mark.parametrize(("make_env", "expected"), [(Drift, None), (Simulator, None), (delayed, "FixedDelay(delay=2)")])
-def test_environments_in_processes_of_their_own(make_env, expected):
+def own():
+    return delayed(OwnDelay())
+
+
+@pytest.mark.parametrize(("make_env", "ages"), [(Drift, [0]), (Simulator, [0]), (delayed, [2]), (own, [0, 1, 2])])
+def test_environments_in_processes_of_their_own(make_env, ages):
     vec = make_vec_env(make_env, 2, vec_env_cls=SubprocVecEnv)
     try:
-        assert make(vec).learn(20).trained_delay == expected
+        assert make(vec).learn(20).trained_ages == ages
     finally:
         vec.close()
 

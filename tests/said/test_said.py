@@ -195,13 +195,13 @@ def test_only_a_planner_of_every_delay_takes_another_one_silently(trained, saved
     without_planner = make().learn(80)
     without_planner.policy.planner_updates.zero_()
     without_planner.save(tmp_path / "agent")
-    with pytest.warns(UserWarning, match=r"SAID learned under FixedDelay\(delay=2\) and is given EpisodeDelay"):
+    with pytest.warns(UserWarning, match=r"SAID learned at ages 2 and is given 0, 1:"):
         SAID.load(tmp_path / "agent", env=delayed((0, 2)), device="cpu")
 
 
 @pytest.mark.parametrize("delay", [(0, 2), 1, UniformDelay(1, 2)])
 def test_a_planner_for_one_age_refuses_environments_of_others(delay, tmp_path):
-    with pytest.warns(UserWarning, match="mask='fixed' answers under delay=2 only"):  # the expert may learn there
+    with pytest.warns(UserWarning, match="mask='fixed' answers at age 2 only"):  # the expert may learn there
         make(delayed(delay, max_delay=2), planner_kwargs={"mask": "fixed"})
     model = make(planner_kwargs={"mask": "fixed"}).learn(60)
     model.save(tmp_path / "agent")
@@ -211,13 +211,13 @@ def test_a_planner_for_one_age_refuses_environments_of_others(delay, tmp_path):
     ):
         with (
             warnings.catch_warnings(),
-            pytest.raises(ValueError, match="mask='fixed' answers under delay=2 only, but this environment"),
+            pytest.raises(ValueError, match="mask='fixed' answers at age 2 only, but this environment"),
         ):
             warnings.simplefilter("error")
             take()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for same in (2, (2, 2), TotalDelay(1, (1, 1))):
+        for same in (2, (2, 2), TotalDelay(1, (1, 1)), "HeldDelay(2)"):
             SAID.load(tmp_path / "agent", env=delayed(same), device="cpu")
 
 

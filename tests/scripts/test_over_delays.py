@@ -172,7 +172,7 @@ def test_workers_change_the_speed_only(said: Path, tmp_path: Path) -> None:
 
 
 def test_only_the_warning_of_another_delay_is_silent(sadr: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.warns(UserWarning, match="learned under"):
+    with pytest.warns(UserWarning, match="learned at ages"):
         load_run(sadr, delay=0, device="cpu")
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -259,12 +259,45 @@ def test_under_a_delay_that_varies_the_papers_planner_knows_all(delay: zoo.Delay
     assert varying == {**fixed, "mask": "random"}
 
 
+def test_where_the_expert_meets_larger_delays_the_papers_planner_knows_all() -> None:
+    """A planner of ``mask: fixed`` answers under the largest delay alone, which would be the expert's."""
+    masks = [
+        zoo.preset_overrides(zoo.config_file("said"), "paper", "Hopper-v5", 4, max_delay)["planner_kwargs"]["mask"]
+        for max_delay in (4, 8)
+    ]
+    assert masks == ["fixed", "random"]
+
+
+def test_a_planner_of_one_delay_has_an_expert_of_another(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
+    command = "--algo said --env Pendulum-v1 --delay 2 --expert-delay 0 --preset smoke -n 510 --eval-freq -1"
+    train_here(tmp_path, command, "-params", "planner_kwargs:dict(mask='fixed')", "planner_gradient_steps:2")
+    assert not [w for w in recwarn if "mask='fixed'" in str(w.message)]
+    played = load_run(tmp_path / "said" / "Pendulum-v1-delay2-expert0_1", device="cpu")
+    assert not [w for w in recwarn if "learned at ages" in str(w.message)]
+    env = played.make_env()
+    obs, _ = env.reset(seed=0)
+    for _ in range(4):
+        obs, *_ = env.step(played.model.predict(obs)[0])
+    with played.model.policy.answering("expert"), pytest.warns(UserWarning, match="learned at ages 0 and is given 2"):
+        played.model.predict(obs)
+
+
+def test_a_planner_of_one_delay_is_refused_a_larger_one_of_its_expert(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        train_here(
+            tmp_path, "--env Pendulum-v1 --delay 2 --expert-delay 0 4", "-params", "planner_kwargs:dict(mask='fixed')"
+        )
+    assert "serves the largest delay alone, here 4, got --delay 2" in capsys.readouterr().err
+
+
 def test_a_planner_of_one_delay_is_refused_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         train_here(
             tmp_path, "--algo said --env Pendulum-v1 --delay 0 3", "-params", "planner_kwargs:dict(mask='fixed')"
         )
-    assert "A planner with mask='fixed' serves one delay, got --delay [0, 3]" in capsys.readouterr().err
+    assert "serves the largest delay alone, here 3, got --delay [0, 3]" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("preset", zoo.PRESETS)
@@ -323,7 +356,7 @@ def test_the_expert_can_learn_under_another_delay(tmp_path: Path) -> None:
     played = load_run(run, device="cpu")
     assert played.info["delay"] == "EpisodeDelay(low=0, high=3)"
     model = played.model
-    assert (model.trained_delay, model.policy.max_delay) == ("FixedDelay(delay=0)", 3)
+    assert (model.trained_ages, model.policy.max_delay) == ([0], 3)
     assert model.policy.planner_is_trained
 
 
