@@ -220,7 +220,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
 
     def _serves(self, ages: list[int]) -> bool:
         """Tell whether answers are as good at ages that training did not bring."""
-        return not ages
+        return False
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Update critics, actor, entropy coefficient and target critics ``gradient_steps`` times, as SAC does."""

@@ -178,8 +178,7 @@ class SAID(DelayedSAC):
 
     def _serves(self, ages: list[int]) -> bool:
         # Masks were drawn from all of 0..D, over true states that replay has at every age
-        planned = self.policy.who_answers == "planner" and self._why_no_answer(ages) is None
-        return planned or super()._serves(ages)
+        return self.policy.who_answers == "planner" and self._why_no_answer(ages) is None
 
     def warmup(self, batch_size: int = 1) -> None:
         """Answer a few times for nothing: see :meth:`SAIDPolicy.warmup`. A control loop calls it once before it starts.
