@@ -137,7 +137,8 @@ class DelayedReplayBuffer(ReplayBuffer):
         self.actions[row] = sent.reshape(self.n_envs, self.action_dim)
         if self.is_delayed:  # else the name is the task's own
             for i, info in enumerate(infos):
-                self.actions[row, i] = info.get(EXECUTED, self.actions[row, i])
+                if EXECUTED in info:
+                    self.actions[row, i] = info[EXECUTED]
         self.rewards[row] = reward
         self.dones[row] = done
         if self.handle_timeout_termination:

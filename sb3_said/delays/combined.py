@@ -22,7 +22,25 @@ from sb3_said.delays.processes import (
 
 
 @dataclass(frozen=True)
-class HeldDelay:
+class _OfProcess:
+    """What processes made of one other process share."""
+
+    process: int | tuple[int, int] | DelayProcess
+
+    def __post_init__(self) -> None:
+        make_process(self.process)
+
+    @property
+    def min_delay(self) -> int:
+        return age_range(self.process)[0]
+
+    @property
+    def max_delay(self) -> int:
+        return age_range(self.process)[1]
+
+
+@dataclass(frozen=True)
+class HeldDelay(_OfProcess):
     """A delay that stays for a while: another process, asked anew only at times.
 
     ``HeldDelay(UniformDelay(min_lag, max_lag), hold_prob, update_period)`` draws as the delay buffers of Isaac Lab and
@@ -34,23 +52,14 @@ class HeldDelay:
     :raises ValueError: for a probability outside 0..1 or a period below 1
     """
 
-    process: int | tuple[int, int] | DelayProcess
     hold_prob: float = 0.0
     update_period: int = 1
 
     def __post_init__(self) -> None:
-        make_process(self.process)
+        super().__post_init__()
         check_probability("hold_prob", self.hold_prob)
         check_count("update_period", self.update_period, 1)
         as_int(self, "update_period")
-
-    @property
-    def min_delay(self) -> int:
-        return age_range(self.process)[0]
-
-    @property
-    def max_delay(self) -> int:
-        return age_range(self.process)[1]
 
     def sample(self, rng: np.random.Generator) -> Iterator[int | None]:
         delays = self._draws(rng)
@@ -72,7 +81,7 @@ class HeldDelay:
 
 
 @dataclass(frozen=True)
-class PeriodicPackets:
+class PeriodicPackets(_OfProcess):
     """A slow sensor: only every ``period``-th control step sends a packet, the first after reset ``period`` steps on.
 
     Between packets the age grows: a camera of 10 Hz in a control loop of 50 Hz has ``period=5``.
@@ -82,21 +91,16 @@ class PeriodicPackets:
     :raises ValueError: for a period below 1
     """
 
-    process: int | tuple[int, int] | DelayProcess
     period: int
 
     def __post_init__(self) -> None:
-        make_process(self.process)
+        super().__post_init__()
         check_count("period", self.period, 1)
         as_int(self, "period")
 
     @property
-    def min_delay(self) -> int:
-        return age_range(self.process)[0]
-
-    @property
     def max_delay(self) -> int:
-        return age_range(self.process)[1] + self.period - 1
+        return super().max_delay + self.period - 1
 
     def sample(self, rng: np.random.Generator) -> Iterator[int | None]:
         for delay in packet_delays(make_process(self.process), rng):
@@ -105,7 +109,7 @@ class PeriodicPackets:
 
 
 @dataclass(frozen=True)
-class DroppedPackets:
+class DroppedPackets(_OfProcess):
     """Packets of another process that get lost, each with probability ``p``.
 
     Ages are bounded: where losses in a row would make the newest observation older than ``max_delay``, the packet of
@@ -120,23 +124,18 @@ class DroppedPackets:
     8
     """
 
-    process: int | tuple[int, int] | DelayProcess
     p: float
     max_losses: int = 4
 
     def __post_init__(self) -> None:
-        make_process(self.process)
+        super().__post_init__()
         check_probability("p", self.p)
         check_count("max_losses", self.max_losses, 1)
         as_int(self, "max_losses")
 
     @property
-    def min_delay(self) -> int:
-        return age_range(self.process)[0]
-
-    @property
     def max_delay(self) -> int:
-        return age_range(self.process)[1] + self.max_losses
+        return super().max_delay + self.max_losses
 
     def sample(self, rng: np.random.Generator) -> Iterator[int | None]:
         for delay in packet_delays(make_process(self.process), rng):

@@ -100,18 +100,18 @@ def _rows(
     the mean action."""
     before, change, lagged = [], [], []
     all_sent = np.concatenate(actions)
+    mean, scale, varies = all_sent.mean(0), all_sent.std(0), _varies(all_sent)  # (act_dim,) each
     for o, sent in zip(observations, actions, strict=True):  # (T + 1, obs_dim), (T, act_dim)
         step = np.diff(o, axis=0)  # (T, obs_dim)
         t = 1 + np.flatnonzero(np.any(step[1:] != 0, axis=1))
         before.append(np.hstack([o[t], step[t - 1]]))
         change.append(step[t])
-        a = np.concatenate([np.zeros((max_delay, sent.shape[1])), sent - all_sent.mean(0)])
+        a = np.concatenate([np.zeros((max_delay, sent.shape[1])), sent - mean])
         lagged.append(a[max_delay + t - np.arange(max_delay + 1)[:, None]])  # (max_delay + 1, n, act_dim)
     size = np.abs(np.concatenate(observations)).max(0)  # (obs_dim,)
     x, y = _standardise(np.concatenate(before), np.tile(size, 2)), _standardise(np.concatenate(change), size)
     a = np.concatenate(lagged, axis=1)
-    varies = _varies(all_sent)
-    return np.hstack([x, np.ones((len(x), 1))]), y, a[..., varies] / all_sent.std(0)[varies]
+    return np.hstack([x, np.ones((len(x), 1))]), y, a[..., varies] / scale[varies]
 
 
 def _standardise(x: np.ndarray, size: np.ndarray) -> np.ndarray:

@@ -191,8 +191,10 @@ class DelayedSAC(SafeSaveMixin, SAC):
 
         :param ages: that it will meet, in control steps (see :func:`ages_of`)
         """
-        unmet = [] if self.trained_ages is None else sorted(set(ages) - set(self.trained_ages))
-        if self.trained_ages is None or not unmet or self._serves(ages):
+        if self.trained_ages is None:
+            return
+        unmet = sorted(set(ages) - set(self.trained_ages))
+        if not unmet or self._serves(ages):
             return
         warnings.warn(
             f"This {type(self).__name__} learned at ages {written_ages(self.trained_ages)} and is given "
@@ -329,7 +331,7 @@ def ages_of(env: GymEnv | None) -> list[int]:
     :param env: one environment, or several that may have other delays
     """
     # Asked for first: a missing attribute ends the workers of a SubprocVecEnv. A plain task may have one of its own.
-    if env is None or isinstance(env, str) or not isinstance(env.observation_space, spaces.Dict):
+    if env is None or not isinstance(env.observation_space, spaces.Dict):
         return [0]
     if isinstance(env, VecEnv):
         ranges = env.get_attr("age_range") if env.has_attr("age_range") else [(0, 0)]
