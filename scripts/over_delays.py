@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +41,9 @@ examples:
   python scripts/over_delays.py any=logs/said/Hopper-v5-delay0-16_1 each=logs/said/Hopper-v5-delay0_1 \\
       each=logs/said/Hopper-v5-delay4_1 each=logs/said/Hopper-v5-delay16_1 --delays 0 4 16 --json hopper.json
 
+  # the table and the plot once more, of some rows and delays: without runs nothing is played
+  python scripts/over_delays.py --json hopper.json --rows "any planner" "each planner" --delays 0 4 16 --plot hopper.png
+
 Of a SAID agent, the planner and the expert are played, or one of them (--answer). An agent cannot play delays that it
 was not built for: such a cell stays empty. It does play delays that it was not trained with, which is the point here,
 without a warning.
@@ -56,12 +59,15 @@ def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("runs", nargs="+", metavar="[LABEL=]RUN_OR_ZIP", help="run folders, or agents' .zip files")
-    parser.add_argument("--delays", nargs="+", required=True, metavar="DELAY", help="each a number of control steps, "
-                        "or a process of docs/delays.md in quotes, such as 'DroppedPackets(4, p=0.1)'")  # fmt: skip
+    parser.add_argument("runs", nargs="*", metavar="[LABEL=]RUN_OR_ZIP", help="run folders, or agents' .zip files; "
+                        "without any, what --json holds is shown")  # fmt: skip
+    parser.add_argument("--delays", nargs="+", metavar="DELAY", help="each a number of control steps, or a process of "
+                        "docs/delays.md in quotes, such as 'DroppedPackets(4, p=0.1)'")  # fmt: skip
     parser.add_argument("--answer", choices=ANSWERS, help="of SAID agents, play this one alone (default: both)")
     parser.add_argument("--json", type=Path, required=True, help="where to write the numbers, and to go on from them")
     parser.add_argument("--plot", type=Path, help="draw return over delay to this .png or .pdf")
+    parser.add_argument("--rows", nargs="+", metavar="ROW", help="rows of the table and the plot, in this order, each "
+                        "a label, and 'LABEL planner' or 'LABEL expert' of a SAID agent (default: all)")  # fmt: skip
     parser.add_argument("--episodes", type=int, default=20, help="whole episodes for each cell (default: 20)")
     parser.add_argument("--seed", type=int, default=10_000, help="reset seed of the first episode (default: 10000)")
     parser.add_argument("--n-envs", type=int, default=8, help="episodes played side by side (default: 8)")
@@ -100,37 +106,24 @@ def main(argv: list[str] | None = None) -> None:
     try:
         if args.plot is not None:
             plots.panels()  # without matplotlib, fail now and not after the episodes
-        delays = list(dict.fromkeys(read_name(word) for word in args.delays))
-        runs = open_runs(args)
-        first = next(iter(runs.values()))[0]
-        env_id = first.info["env"]
-        settings = {"env": env_id, "n_episodes": args.episodes, "seed": args.seed, "deterministic": True}
-        cells = [cell for label, row in runs.items() for cell in cells_of(label, row, delays, args.answer)]
-        results = Results(args.json, settings, cells)
+        delays = list(dict.fromkeys(read_name(word) for word in args.delays or ()))
+        results = asked_results(args, delays) if args.runs else Results.read(args.json, delays)
+        rows = choose_rows(args.rows, results.cells)
     except ValueError as error:
         parser.error(str(error))
     except ImportError as error:
         parser.exit(1, f"{error}\n")
 
-    for cell in cells:
-        if cell.obstacle is not None:
-            print(f"{cell.agent} cannot play delay {cell.delay}: {cell.obstacle}.")
-    todo = [cell for cell in cells if cell not in results.found]
-    last_seed = args.seed + args.episodes - 1
-    print(f"{env_id}, reset seeds {args.seed}..{last_seed}: {len(todo)} of {len(cells)} cells to play")
-    if todo:
-        results.origins.append(origin(first))
-    try:
-        for done, (cell, summary) in enumerate(play_all(todo, env_id, args), 1):
-            results.add(cell, summary)
-            print(f"{done}/{len(todo)} {cell.agent}, delay {cell.delay}: {summary.mean_return}", flush=True)
-    except KeyboardInterrupt:
-        parser.exit(130, "\nInterrupted; the same command goes on.\n")
-    results.write()
-
-    table = results.table()
-    print_table(table, delays)
-    print(f"Wrote {args.json}")
+    env_id, n_episodes, seed = (results.settings[key] for key in ("env", "n_episodes", "seed"))
+    print(f"{env_id}, {n_episodes} episodes a cell, reset seeds {seed}..{seed + n_episodes - 1}")
+    if args.runs:
+        try:
+            play_missing(results, args)
+        except KeyboardInterrupt:
+            parser.exit(130, "\nInterrupted; the same command goes on.\n")
+        print(f"Wrote {args.json}")
+    table = results.table(rows)
+    print_table(table, delays or list(dict.fromkeys(cell.delay for cell in results.cells)))
     if args.plot is not None and any(table.values()):
         plots.save(plots.plot_over_delays(table)[0], args.plot)
         print(f"Wrote {args.plot}")
@@ -145,6 +138,47 @@ def read_name(word: str) -> int | str:
     assert delay is not None  # for mypy: there is a word
     process = make_process(delay)
     return process.delay if isinstance(process, FixedDelay) else word
+
+
+def choose_rows(names: list[str] | None, cells: list[Cell]) -> list[str]:
+    """Return the rows of the table: those asked for, or all.
+
+    :raises ValueError: for a row that there is not
+    """
+    known = list(dict.fromkeys(cell.agent for cell in cells))
+    if unknown := [name for name in names or () if name not in known]:
+        raise ValueError(f"--rows names {', '.join(unknown)}, but the rows are {', '.join(known)}.")
+    return names or known
+
+
+def asked_results(args: argparse.Namespace, delays: list[int | str]) -> Results:
+    """Return the results of the runs of the command line, as far as they are known.
+
+    :raises ValueError: for runs that cannot be opened or compared, and without a delay
+    """
+    if not delays:
+        raise ValueError("--delays is missing: name the delays that the runs are to play.")
+    runs = open_runs(args)
+    first = next(iter(runs.values()))[0]
+    settings = {"env": first.info["env"], "n_episodes": args.episodes, "seed": args.seed, "deterministic": True}
+    cells = [cell for label, row in runs.items() for cell in cells_of(label, row, delays, args.answer)]
+    results = Results(args.json, settings, cells)
+    if any(cell not in results.found for cell in cells):
+        results.origins.append(origin(first))
+    return results
+
+
+def play_missing(results: Results, args: argparse.Namespace) -> None:
+    """Play the cells that are not known yet, and write each as it is done."""
+    for cell in results.cells:
+        if cell.obstacle is not None:
+            print(f"{cell.agent} cannot play delay {cell.delay}: {cell.obstacle}.")
+    todo = [cell for cell in results.cells if cell not in results.found]
+    print(f"{len(todo)} of {len(results.cells)} cells to play")
+    for done, (cell, summary) in enumerate(play_all(todo, results.settings["env"], args), 1):
+        results.add(cell, summary)
+        print(f"{done}/{len(todo)} {cell.agent}, delay {cell.delay}: {summary.mean_return}", flush=True)
+    results.write()
 
 
 def open_runs(args: argparse.Namespace) -> dict[str, list[LoadedRun]]:
@@ -248,13 +282,40 @@ class Results:
         #: JSON entries beside what the cell says: its result, and which of the origins made it
         self.found: dict[Cell, dict[str, Any]] = {}
         for cell in cells:
-            entry = old.pop(_key(asdict(cell)), None)
+            entry = old.get(_key(asdict(cell)))
             if cell.obstacle is not None:
                 self.found[cell] = {"origin": None, "result": None}
             elif entry is not None:
                 self.found[cell] = {key: entry[key] for key in ("origin", "result")}
         asked = {cell.file: cell.sha256 for cell in cells}
-        self.others = [entry for entry in old.values() if asked.get(entry["file"], entry["sha256"]) == entry["sha256"]]
+        keys = {_key(asdict(cell)) for cell in cells}
+        self.others = [
+            entry
+            for entry in document["cells"]
+            if _key(entry) not in keys and asked.get(entry["file"], entry["sha256"]) == entry["sha256"]
+        ]
+
+    @classmethod
+    def read(cls, path: Path, delays: list[int | str]) -> Results:
+        """Return what a file holds.
+
+        :param delays: those of interest, in this order; all by default
+        :raises ValueError: without the file
+        """
+        if not path.exists():
+            raise ValueError(f"{path} does not exist, and no runs are given: name the runs to play.")
+        document = json.loads(path.read_text())
+        names = [field.name for field in fields(Cell)]
+        cells = [Cell(**{name: entry[name] for name in names}) for entry in document.pop("cells")]
+        del document["origins"]
+        if delays:  # by what they are, however they are written
+            cells = [
+                replace(cell, delay=delay)
+                for delay in delays
+                for cell in cells
+                if make_process(cell.delay) == make_process(delay)
+            ]
+        return cls(path, document, cells)
 
     def add(self, cell: Cell, summary: Summary) -> None:
         """Keep what was played now."""
@@ -269,11 +330,11 @@ class Results:
         document = {**self.settings, "origins": self.origins, "cells": cells + self.others}
         write_json(self.path, document)
 
-    def table(self) -> dict[str, dict[int | str, Summary]]:
-        """Return for each agent what it did under each delay that it could play."""
-        table: dict[str, dict[int | str, Summary]] = {cell.agent: {} for cell in self.cells}
+    def table(self, rows: list[str]) -> dict[str, dict[int | str, Summary]]:
+        """Return for each row's agent what it did under each delay that it could play."""
+        table: dict[str, dict[int | str, Summary]] = {row: {} for row in rows}
         for cell in self.cells:
-            if (result := self.found[cell]["result"]) is not None:
+            if cell.agent in table and (result := self.found[cell]["result"]) is not None:
                 table[cell.agent][cell.delay] = Summary.from_episodes(cell.agent, result["returns"], result["lengths"])
         return table
 

@@ -148,6 +148,42 @@ def test_what_was_played_is_not_played_again(said: Path, sadr: Path, tmp_path: P
         assert len(rest) == 5
 
 
+def test_without_runs_what_was_played_is_shown(
+    said: Path, sadr: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("matplotlib")
+    file, plot = tmp_path / "out.json", tmp_path / "plot.png"
+    runs = [f"any={said}", f"one={sadr}", f"again={sadr}"]
+    play(file, runs, ["0", "UniformDelay(0, 1)", "1", "2"])
+    full, written, played = capsys.readouterr().out, file.read_bytes(), count_plays(monkeypatch)
+
+    def show(*words: str) -> list[list[str]]:
+        over_delays.main(["--json", str(file), *words])
+        lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
+        return [[word.strip() for word in line.split("|")[1:-1]] for line in lines]
+
+    assert show() == [[word.strip() for word in line.split("|")[1:-1]] for line in full.splitlines() if "|" in line]
+    header, _, first, second = show("--rows", "one", "any expert", "--delays", "1", "UniformDelay(low=0, high=1)",
+                                    "--plot", str(plot))  # fmt: skip
+    assert header[1:3] == ["1", "UniformDelay(low=0, high=1)"]
+    cells = by_cell(json.loads(written))
+    for row, agent in ((first, "one"), (second, "any expert")):
+        assert row[0] == agent
+        for column, delay in ((1, 1), (2, "UniformDelay(0, 1)")):
+            assert row[column].startswith(f"{np.mean(cells[agent, delay]['returns']):.1f} [")
+    assert plot.read_bytes()[:4] == b"\x89PNG"
+    play(file, runs, ["0", "1"], "--rows", "again")
+    assert not played  # an agent under two labels is known under both
+    assert file.read_bytes() != written and by_cell(json.loads(file.read_text())) == cells
+    for words, message in ((["--rows", "x"], "the rows are any planner"), (["--json", str(plot) + "x"], "not exist")):
+        with pytest.raises(SystemExit):
+            show(*words)
+        assert message in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        over_delays.main([str(said), "--json", str(file)])
+    assert "--delays is missing" in capsys.readouterr().err
+
+
 def test_a_changed_agent_is_played_again(said: Path, tmp_path: Path, monkeypatch) -> None:
     file, folder = tmp_path / "out.json", tmp_path / "d1"
     write_run(folder, DelayedSAC, 1)
