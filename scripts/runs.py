@@ -24,10 +24,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from zoo import ALGOS, WRAPPER, Delay, largest_delay
 
 from sb3_said import DelayedSAC
+from sb3_said.common.ages import ages_of
 from sb3_said.common.spaces import has_state_history
 from sb3_said.delays import DelayProcess, FixedDelay
 from sb3_said.evaluation.rollout import Observation
-from sb3_said.sac.delayed_sac import ages_of
 from sb3_said.said.policies import Answer
 
 ANSWERS = get_args(Answer)

@@ -21,8 +21,8 @@ from stable_baselines3.common.type_aliases import (
     Schedule,
 )
 from stable_baselines3.common.utils import polyak_update
-from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_said.common.ages import ages_of, written_ages
 from sb3_said.common.buffers import DelayedReplayBuffer
 from sb3_said.common.checks import check_choice
 from sb3_said.common.precision import PRECISIONS, autocast
@@ -323,24 +323,3 @@ class DelayedSAC(SafeSaveMixin, SAC):
             super().load_replay_buffer(path, truncate_last_traj)
             return
         self.replay_buffer.load_state_dict(state)
-
-
-def ages_of(env: GymEnv | None) -> list[int]:
-    """Return the ages that observations can have amid the episodes of an environment, [0] where nothing is delayed.
-
-    :param env: one environment, or several that may have other delays
-    """
-    # Asked for first: a missing attribute ends the workers of a SubprocVecEnv. A plain task may have one of its own.
-    if env is None or not isinstance(env.observation_space, spaces.Dict):
-        return [0]
-    if isinstance(env, VecEnv):
-        ranges = env.get_attr("age_range") if env.has_attr("age_range") else [(0, 0)]
-    else:
-        ranges = [env.get_wrapper_attr("age_range") if env.has_wrapper_attr("age_range") else (0, 0)]
-    return sorted({age for low, high in ranges for age in range(low, high + 1)})
-
-
-def written_ages(ages: list[int]) -> str:
-    """Write ages as a reader would, ``0..8`` or ``2, 5``."""
-    is_range = len(ages) > 2 and ages == list(range(ages[0], ages[-1] + 1))
-    return f"{ages[0]}..{ages[-1]}" if is_range else ", ".join(map(str, ages))
