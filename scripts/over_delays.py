@@ -300,7 +300,7 @@ class Results:
         """Return what a file holds.
 
         :param delays: those of interest, in this order; all by default
-        :raises ValueError: without the file
+        :raises ValueError: without the file, or when it holds nothing of these delays
         """
         if not path.exists():
             raise ValueError(f"{path} does not exist, and no runs are given: name the runs to play.")
@@ -315,6 +315,8 @@ class Results:
                 for cell in cells
                 if make_process(cell.delay) == make_process(delay)
             ]
+        if not cells:
+            raise ValueError(f"{path} holds nothing{f' of the delays {delays}' if delays else ''}: name runs to play.")
         return cls(path, document, cells)
 
     def add(self, cell: Cell, summary: Summary) -> None:

@@ -175,7 +175,11 @@ def test_without_runs_what_was_played_is_shown(
     play(file, runs, ["0", "1"], "--rows", "again")
     assert not played  # an agent under two labels is known under both
     assert file.read_bytes() != written and by_cell(json.loads(file.read_text())) == cells
-    for words, message in ((["--rows", "x"], "the rows are any planner"), (["--json", str(plot) + "x"], "not exist")):
+    for words, message in (
+        (["--rows", "x"], "the rows are any planner"),
+        (["--delays", "16"], "holds nothing of the delays [16]"),
+        (["--json", str(plot) + "x"], "not exist"),
+    ):
         with pytest.raises(SystemExit):
             show(*words)
         assert message in capsys.readouterr().err
