@@ -31,3 +31,23 @@ class Drift(gym.Env):
 def delayed(delay=2, max_delay=None, **kwargs):
     """Return the task under a delay; ``kwargs`` are those of ``Drift``."""
     return DelayedObservationWrapper(Drift(**kwargs), delay, max_delay=max_delay)
+
+
+class OwnDelay:
+    """A user's own process, which a worker cannot be sent: its class is not where pickle looks for it."""
+
+    __module__ = "nowhere"
+    max_delay = 2
+
+    def sample(self, rng):
+        return int(rng.integers(3))
+
+
+class LateDelay(OwnDelay):
+    min_delay = 1
+
+
+class Simulator(Drift):
+    """A plain task whose ``process`` is no delay."""
+
+    process = "a program"

@@ -1,36 +1,11 @@
 """Which ages an environment's observations have, and how they are written."""
 
 import pytest
-from small_task import Drift, delayed
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from small_task import Drift, LateDelay, OwnDelay, delayed
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_said.common.ages import ages_of, written_ages
 from sb3_said.delays import TotalDelay
-
-
-class OwnDelay:
-    """A user's own process, which a worker cannot be sent: its class is not where pickle looks for it."""
-
-    __module__ = "nowhere"
-    max_delay = 2
-
-    def sample(self, rng):
-        return int(rng.integers(3))
-
-
-class LateDelay(OwnDelay):
-    min_delay = 1
-
-
-class Simulator(Drift):
-    """A plain task whose ``process`` is no delay."""
-
-    process = "a program"
-
-
-def own():
-    return delayed(OwnDelay())
 
 
 @pytest.mark.parametrize(
@@ -42,7 +17,7 @@ def own():
         (delayed(1, max_delay=2), [1]),
         (delayed((0, 2)), [0, 1, 2]),
         (delayed(TotalDelay(1, 1)), [2]),
-        (own(), [0, 1, 2]),  # does not say its smallest
+        (delayed(OwnDelay()), [0, 1, 2]),  # does not say its smallest
         (delayed(LateDelay()), [1, 2]),
     ],
     ids=str,
@@ -57,15 +32,6 @@ def test_of_one_environment_and_of_several_alike(env, ages):
 def test_each_of_several_environments_has_ages_of_its_own(first):
     envs = [lambda: delayed(0, max_delay=3), lambda: delayed((2, 3))]
     assert ages_of(DummyVecEnv([envs[first], envs[1 - first]])) == [0, 2, 3]
-
-
-@pytest.mark.parametrize(("make_env", "ages"), [(Drift, [0]), (Simulator, [0]), (delayed, [2]), (own, [0, 1, 2])])
-def test_of_environments_in_processes_of_their_own(make_env, ages):
-    env = make_vec_env(make_env, 2, vec_env_cls=SubprocVecEnv)
-    try:
-        assert ages_of(env) == ages
-    finally:
-        env.close()
 
 
 @pytest.mark.parametrize(("ages", "text"), [([3], "3"), ([2, 3], "2, 3"), ([0, 1, 2], "0..2"), ([0, 2, 3], "0, 2, 3")])

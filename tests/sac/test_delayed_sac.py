@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from kill import Kill, Killed
-from small_task import Drift, delayed
+from small_task import Drift, LateDelay, OwnDelay, Simulator, delayed
 from stable_baselines3 import SAC
 from stable_baselines3.common import policies
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
@@ -20,7 +20,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.save_util import save_to_pkl
 from stable_baselines3.common.torch_layers import CombinedExtractor
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.common.buffers import UNDELAYED
@@ -240,6 +240,14 @@ def test_ages_that_it_has_not_met_are_never_taken_silently(tmp_path):
     assert model.env.get_attr("max_delay") == [2]  # what is refused is not taken
 
 
+@pytest.mark.parametrize("first", [0, 1])
+def test_each_of_several_environments_has_ages_of_its_own(first):
+    envs = [lambda: delayed(1, max_delay=2), lambda: delayed(2)]
+    model = make(DummyVecEnv(envs[:1] * 2)).learn(30)
+    with pytest.warns(UserWarning, match="learned at ages 1 and is given 2:"):
+        model.set_env(DummyVecEnv([envs[first], envs[1 - first]]))
+
+
 @pytest.mark.parametrize("n", [None, 1, 3])
 def test_ages_that_it_has_not_met_are_noticed_in_its_observations(n):
     """``evaluate_policy`` and a robot's control loop hand over no environment to be checked."""
@@ -256,6 +264,13 @@ def test_ages_that_it_has_not_met_are_noticed_in_its_observations(n):
     batch = late if n is None else {key: np.stack([row[key] for row in (*rows, late)]) for key in obs}
     with pytest.warns(UserWarning, match="learned at ages 1 and is given 2: what it does"):
         model.predict(batch)
+
+
+def test_own_delays_may_say_their_smallest():
+    model = make(delayed(LateDelay())).learn(30)
+    assert model.trained_ages == [1, 2]
+    with pytest.warns(UserWarning, match=r"learned at ages 1, 2 and is given 0:"):
+        model.set_env(delayed(OwnDelay()))
 
 
 def test_precision_is_what_was_asked_for():
@@ -321,6 +336,19 @@ def test_save_and_load(tmp_path):
         DelayedSAC.load(tmp_path / "agent", env=delayed(3))
     with pytest.raises(ValueError, match="built for max_delay=2, but this environment has max_delay=3"):
         model.set_env(delayed(3))
+
+
+def own():
+    return delayed(OwnDelay())
+
+
+@pytest.mark.parametrize(("make_env", "ages"), [(Drift, [0]), (Simulator, [0]), (delayed, [2]), (own, [0, 1, 2])])
+def test_environments_in_processes_of_their_own(make_env, ages):
+    vec = make_vec_env(make_env, 2, vec_env_cls=SubprocVecEnv)
+    try:
+        assert make(vec).learn(20).trained_ages == ages
+    finally:
+        vec.close()
 
 
 class Stop(BaseCallback):
