@@ -163,7 +163,7 @@ def asked_results(args: argparse.Namespace, delays: list[int | str]) -> Results:
     settings = {"env": first.info["env"], "n_episodes": args.episodes, "seed": args.seed, "deterministic": True}
     cells = [cell for label, row in runs.items() for cell in cells_of(label, row, delays, args.answer)]
     results = Results(args.json, settings, cells)
-    if any(cell not in results.found for cell in cells):
+    if results.missing():
         results.origins.append(origin(first))
     return results
 
@@ -173,7 +173,7 @@ def play_missing(results: Results, args: argparse.Namespace) -> None:
     for cell in results.cells:
         if cell.obstacle is not None:
             print(f"{cell.agent} cannot play delay {cell.delay}: {cell.obstacle}.")
-    todo = [cell for cell in results.cells if cell not in results.found]
+    todo = results.missing()
     print(f"{len(todo)} of {len(results.cells)} cells to play")
     for done, (cell, summary) in enumerate(play_all(todo, results.settings["env"], args), 1):
         results.add(cell, summary)
@@ -278,21 +278,23 @@ class Results:
             if held != settings or "cells" not in document:
                 raise ValueError(f"{path} holds {held}, but {settings} is to be played: give another --json.")
         self.origins: list[dict[str, Any]] = document["origins"]
-        old = {_key(entry): entry for entry in document["cells"]}
+        held_cells = [(_key(entry), entry) for entry in document["cells"]]
+        old = dict(held_cells)
+        keys = {cell: _key(asdict(cell)) for cell in cells}
         #: JSON entries beside what the cell says: its result, and which of the origins made it
         self.found: dict[Cell, dict[str, Any]] = {}
         for cell in cells:
-            entry = old.get(_key(asdict(cell)))
+            entry = old.get(keys[cell])
             if cell.obstacle is not None:
                 self.found[cell] = {"origin": None, "result": None}
             elif entry is not None:
                 self.found[cell] = {key: entry[key] for key in ("origin", "result")}
         asked = {cell.file: cell.sha256 for cell in cells}
-        keys = {_key(asdict(cell)) for cell in cells}
+        taken_over = set(keys.values())
         self.others = [
             entry
-            for entry in document["cells"]
-            if _key(entry) not in keys and asked.get(entry["file"], entry["sha256"]) == entry["sha256"]
+            for key, entry in held_cells
+            if key not in taken_over and asked.get(entry["file"], entry["sha256"]) == entry["sha256"]
         ]
 
     @classmethod
@@ -318,6 +320,10 @@ class Results:
         if not cells:
             raise ValueError(f"{path} holds nothing{f' of the delays {delays}' if delays else ''}: name runs to play.")
         return cls(path, document, cells)
+
+    def missing(self) -> list[Cell]:
+        """Return the cells that are still to be played."""
+        return [cell for cell in self.cells if cell not in self.found]
 
     def add(self, cell: Cell, summary: Summary) -> None:
         """Keep what was played now."""
