@@ -29,9 +29,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_said import DelayedSAC
-from sb3_said.common.files import write_text
 from sb3_said.evaluation import bootstrap_interval, rollout
 from sb3_said.evaluation.plots import COLORS, panels, save
+from sb3_said.files.atomic import write_text
 
 RESULTS = Path(__file__).parent.parent / "results" / "expert_updates"
 # What the runs share: SB3's defaults (networks of 256 x 256, batch 256, 3e-4), rl_zoo3's learning_starts for Hopper.

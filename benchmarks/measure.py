@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_said.common import files
-from sb3_said.common.precision import compute_dtype
 from sb3_said.evaluation import Interval, bootstrap_interval
+from sb3_said.files import atomic as files
+from sb3_said.planner.precision import compute_dtype
 
 DTYPES = {"float32": th.float32, "bfloat16": th.bfloat16}
 
@@ -97,7 +97,7 @@ def matmul_rates(device: str | th.device = "cpu") -> dict[str, float]:
 def dtype_name(precision: str, device: str | th.device, size: float = math.inf) -> str:
     """Return the number format that a ``precision`` of ours stands for on a device, as :func:`matmul_rate` takes it.
 
-    :param size: as :func:`~sb3_said.common.precision.compute_dtype` takes it
+    :param size: as :func:`~sb3_said.planner.precision.compute_dtype` takes it
     """
     dtype = compute_dtype(precision, th.device(device), size)
     return next(name for name, other in DTYPES.items() if other == dtype)

@@ -20,7 +20,7 @@ from stable_baselines3.sac.policies import ContinuousCritic
 from torch import nn
 from torch.utils.data import DataLoader, Dataset
 
-from sb3_said.common.windows import Windows
+from sb3_said.replay.windows import Windows
 
 EMBEDDING = 128  # width of the time embedding, CleanDiffuser's emb_dim
 START_TIME, END_TIME = 1e-3, 1.0

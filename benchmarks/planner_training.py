@@ -22,8 +22,8 @@ import torch as th
 from measure import dtype_name, matmul_rates, parser, percentiles, print_table, ratio, turn_by_turn, write_json
 from plain import PlainPlanner, WindowDataset, batches
 
-from sb3_said.common.windows import WindowSource
 from sb3_said.planner import InpaintingPlanner, PlannerConfig, PlannerTrainer
+from sb3_said.replay.windows import WindowSource
 
 OBS_DIM, ACT_DIM = 11, 3  # Hopper-v5
 N_TIME_FEATURES = 32

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from sb3_said.common import precision
-from sb3_said.common.checks import check_choice
-from sb3_said.planner import diffusion, dit, inpainting, normalizer
+from sb3_said.planner import diffusion, dit, inpainting, normalizer, precision
+from sb3_said.planner.checks import check_choice
 
 SCORED_STATES = ("future", "decision", "all")
 LR_SCHEDULES = ("cosine", "constant")

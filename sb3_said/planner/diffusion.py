@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import torch as th
 
-from sb3_said.common.checks import check_choice
+from sb3_said.planner.checks import check_choice
 
 START_TIME = 1e-3  # the cleanest time, in training and as the last solver time (CleanDiffuser, and so the paper)
 END_TIMES = {

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch as th
 from torch import nn
 
-from sb3_said.common.windows import Windows
 from sb3_said.planner.diffusion import check_choice
+from sb3_said.replay.windows import Windows
 
 ACTION_TRANSFORMS = ("standard", "tanh")
 LARGEST_ACTION = 0.999  # the paper's bound before arctanh

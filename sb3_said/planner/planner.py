@@ -10,13 +10,13 @@ from typing import NamedTuple
 import torch as th
 from torch import nn
 
-from sb3_said.common.precision import autocast, compute_dtype
-from sb3_said.common.windows import Windows
 from sb3_said.planner import diffusion, inpainting
 from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.dit import DiT1d
 from sb3_said.planner.normalizer import Normalizer
+from sb3_said.planner.precision import autocast, compute_dtype
 from sb3_said.planner.sampling import Prepared, SamplingCache, addresses, is_frozen
+from sb3_said.replay.windows import Windows
 
 ValueFn = Callable[[th.Tensor, th.Tensor], th.Tensor]
 

@@ -10,12 +10,12 @@ from typing import Any
 
 import torch as th
 
-from sb3_said.common.windows import Windows, WindowSource
 from sb3_said.planner.capture import CapturedStep
 from sb3_said.planner.config import PlannerConfig, weight_settings
 from sb3_said.planner.inpainting import draw_delays
 from sb3_said.planner.planner import InpaintingPlanner
 from sb3_said.planner.yardstick import Present, RegressionYardstick
+from sb3_said.replay.windows import Windows, WindowSource
 
 HELD_OUT_WINDOWS = 1024  # per delay, in evaluate(): tells errors that differ by 2 % apart
 YARDSTICK_LEARNING_RATE = 1e-3

@@ -22,12 +22,12 @@ from stable_baselines3.common.type_aliases import (
 )
 from stable_baselines3.common.utils import polyak_update
 
-from sb3_said.common.ages import ages_of, written_ages
-from sb3_said.common.buffers import DelayedReplayBuffer
-from sb3_said.common.checks import check_choice
-from sb3_said.common.precision import PRECISIONS, autocast
-from sb3_said.common.save_util import PickleRefusedError, SafeSaveMixin, explained_refusal, load_tree, save_tree
-from sb3_said.common.spaces import check_spaces
+from sb3_said.delays.ages import ages_of, written_ages
+from sb3_said.delays.space import check_spaces
+from sb3_said.files.agents import PickleRefusedError, SafeSaveMixin, explained_refusal, load_tree, save_tree
+from sb3_said.planner.checks import check_choice
+from sb3_said.planner.precision import PRECISIONS, autocast
+from sb3_said.replay.buffer import DelayedReplayBuffer
 from sb3_said.sac.networks import FusedAdam, StackedCritic
 from sb3_said.sac.policies import DelayedSACPolicy
 

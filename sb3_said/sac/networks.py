@@ -12,7 +12,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor
 from torch import nn
 
-from sb3_said.common.registry import register_class
+from sb3_said.files.registry import register_class
 
 SQUASH_EPSILON = 1e-6  # of SB3's SquashedDiagGaussianDistribution
 Layers = list[tuple[th.Tensor, th.Tensor]]

@@ -11,11 +11,11 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Flatten
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
 
-from sb3_said.common.buffers import UNDELAYED
-from sb3_said.common.extractors import KeyExtractor, StateAugmentedExtractor
-from sb3_said.common.registry import register_class
-from sb3_said.common.save_util import SafePolicyMixin
-from sb3_said.common.spaces import check_spaces
+from sb3_said.delays.space import check_spaces
+from sb3_said.files.agents import SafePolicyMixin
+from sb3_said.files.registry import register_class
+from sb3_said.replay.buffer import UNDELAYED
+from sb3_said.sac.extractors import KeyExtractor, StateAugmentedExtractor
 from sb3_said.sac.networks import FusedAdam, StackedActor, StackedCritic
 
 

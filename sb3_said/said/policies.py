@@ -14,10 +14,10 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
-from sb3_said.common.buffers import UNDELAYED
-from sb3_said.common.registry import register_class
-from sb3_said.common.spaces import check_spaces, has_state_history
+from sb3_said.delays.space import check_spaces, has_state_history
+from sb3_said.files.registry import register_class
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
+from sb3_said.replay.buffer import UNDELAYED
 from sb3_said.sac.policies import DelayedSACPolicy
 
 Answer = Literal["planner", "expert"]

@@ -11,7 +11,7 @@ import torch as th
 from stable_baselines3.common.buffers import DictReplayBuffer
 
 from sb3_said import DelayedObservationWrapper
-from sb3_said.common.buffers import DelayedReplayBuffer
+from sb3_said.replay.buffer import DelayedReplayBuffer
 
 
 def test_both_buffers_return_the_same(monkeypatch):

@@ -19,8 +19,8 @@ from small_planner import (
     seeded,
 )
 
-from sb3_said.common.windows import Windows
 from sb3_said.planner import InpaintingPlanner
+from sb3_said.replay.windows import Windows
 
 
 def make_extra(n, max_delay=DELAY, seed=7):

@@ -17,9 +17,9 @@ from linear_system import (
     riccati,
 )
 
-from sb3_said.common.windows import WindowSource
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner.trainer import PlannerTrainer
+from sb3_said.replay.windows import WindowSource
 
 pytestmark = pytest.mark.slow
 D = 3

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from small_planner import ACT, LENGTH, OBS, make_planner, make_windows, seeded
 
-from sb3_said.common.windows import Windows
 from sb3_said.planner.normalizer import Normalizer
+from sb3_said.replay.windows import Windows
 
 
 @pytest.mark.parametrize("transform", ["standard", "tanh"])

@@ -24,11 +24,10 @@ from small_planner import (
 )
 from torch.utils.flop_counter import FlopCounterMode
 
-from sb3_said.common import precision
-from sb3_said.common.windows import Windows
-from sb3_said.planner import InpaintingPlanner
+from sb3_said.planner import InpaintingPlanner, precision
 from sb3_said.planner.diffusion import alpha_sigma, draw_times
 from sb3_said.planner.planner import choose
+from sb3_said.replay.windows import Windows
 
 # --- loss ------------------------------------------------------------------------------------------------------------
 

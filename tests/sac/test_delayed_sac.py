@@ -23,9 +23,9 @@ from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
-from sb3_said.common.buffers import UNDELAYED
-from sb3_said.common.precision import has_bfloat16
 from sb3_said.delays import TotalDelay, UniformDelay
+from sb3_said.planner.precision import has_bfloat16
+from sb3_said.replay.buffer import UNDELAYED
 
 AUGMENTED = {"observation", "action_history", "delay"}
 

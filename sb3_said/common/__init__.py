@@ -1,1 +1,0 @@
-"""Building blocks shared by the algorithms: replay, windows, extractors, saving."""

@@ -1,0 +1,454 @@
+"""A replay buffer that stores every true state once and rebuilds delayed observations by index arithmetic."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
+from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_said.delays.space import check_spaces
+from sb3_said.files.registry import register_class
+from sb3_said.planner.values import average_reward_tail, discounted_values, normalise_values
+from sb3_said.replay.windows import Windows, WindowSource
+
+#: Key of the true state in ``info`` and in sampled observations; never part of an environment's observation space.
+UNDELAYED = "undelayed_observation"
+#: Key in ``info`` of what the task was given, where that is not the action sent last.
+EXECUTED = "executed_action"
+_ROW_ARRAYS = ("observations", "actions", "rewards", "dones", "timeouts", "ages", "steps", "tail_slots")
+
+
+@register_class
+class DelayedReplayBuffer(ReplayBuffer):
+    """Replay of a delayed task, at the memory of an undelayed one.
+
+    Each row holds s_t, a_t, r_t, done, timeout, the age of the observation at t and the step t within its episode.
+    s_{t+1} is the next row's state, except where no row continues the episode; there it is kept aside (a *tail*).
+    Sampling returns what a store of whole transitions would, bit for bit. For a delayed observation space the sampled
+    observations have the extra key ``undelayed_observation``, the true state, for a delay-reconciled critic, and no
+    ``state_history``, which neither actor nor critics read.
+
+    The stored action is the one that was executed, as ``action_history`` says, or ``info["executed_action"]`` where
+    each action takes a time of its own to the actuator. The critics' transitions are the task's own there, too; rebuilt
+    histories hold what was executed instead of what was sent, which differs while delays change.
+
+    :param buffer_size: transitions over all environments
+    :param observation_space: that of ``DelayedObservationWrapper``, or a 1-D Box (delay 0)
+    :param action_space: bounded 1-D Box
+    :param device: of sampled tensors
+    :param n_envs: parallel environments
+    :param optimize_memory_usage: accepted for SB3's sake; must be False, as memory is optimized anyway
+    :param handle_timeout_termination: bootstrap at time limits
+    :param exchanged_ages: part of the sampled transitions that are shown as they would have been observed at another
+        one's age, in [0, 1]. The true states are all known, so that an episode under one delay teaches the others too;
+        where there is but one delay, nothing changes
+    :raises ValueError: for other spaces, a part outside [0, 1], or when the buffer cannot hold more steps than the
+        largest delay
+    """
+
+    next_observations: None  # type: ignore[assignment]  # rebuilt, never stored
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        device: th.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        handle_timeout_termination: bool = True,
+        exchanged_ages: float = 0.0,
+    ):
+        BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_envs=n_envs)
+        if optimize_memory_usage:
+            raise ValueError("DelayedReplayBuffer stores each state once already; leave optimize_memory_usage=False.")
+        self.optimize_memory_usage = False
+        if not 0.0 <= exchanged_ages <= 1.0:
+            raise ValueError(f"exchanged_ages is a part of the transitions in [0, 1], got {exchanged_ages}.")
+        self.exchanged_ages = exchanged_ages
+        self.handle_timeout_termination = handle_timeout_termination
+        self.buffer_size = max(buffer_size // n_envs, 1)
+        self.is_delayed = isinstance(observation_space, spaces.Dict)
+        state_space, self.max_delay = check_spaces(observation_space, action_space)
+        if self.buffer_size <= self.max_delay + 1:
+            raise ValueError(
+                f"A buffer of {self.buffer_size} steps per environment cannot rebuild observations that are up to "
+                f"{self.max_delay} steps old; use a buffer_size of at least {(self.max_delay + 2) * n_envs}."
+            )
+        shape = (self.buffer_size, n_envs)
+        self.observations = np.zeros((*shape, state_space.shape[0]), np.float32)
+        self.actions = np.zeros((*shape, self.action_dim), np.float32)
+        self.rewards = np.zeros(shape, np.float32)
+        self.dones = np.zeros(shape, np.float32)
+        self.timeouts = np.zeros(shape, np.float32)
+        self.ages = np.zeros(shape, np.int16)
+        self.steps = np.zeros(shape, np.int32)
+        # Tails: (state, age) that follow a row which no stored row continues. Slot -1: the next row continues.
+        self.tail_slots = np.full(shape, -1, np.int32)
+        self.tail_states: np.ndarray = np.zeros((0, state_space.shape[0]), np.float32)
+        self.tail_ages: np.ndarray = np.zeros(0, np.int16)
+        self._free_slots: list[int] = []
+        # What follows the newest row of each environment, and the observation that would continue its episode.
+        self._next_states = np.zeros((n_envs, state_space.shape[0]), np.float32)
+        self._next_ages = np.zeros(n_envs, np.int16)
+        self._expected: dict[str, np.ndarray] | None = None
+
+    # ------------------------------------------------------------------------------------------------ writing
+
+    def add(
+        self,
+        obs: np.ndarray | dict[str, np.ndarray],
+        next_obs: np.ndarray | dict[str, np.ndarray],
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Store one transition of every environment.
+
+        :param obs: observation before the action, (n_envs, obs_dim) or the wrapper's dict
+        :param next_obs: observation after it; at an episode's end its last one, not the one after reset
+        :param action: (n_envs, act_dim) in [-1, 1]
+        :param infos: each with ``undelayed_observation`` when the space is delayed
+        :raises ValueError: when the true state is missing, or the past of ``obs`` is neither stored nor empty, or
+            ``next_obs`` is not one action later
+        """
+        obs, next_obs = (x if isinstance(x, dict) else {"observation": x} for x in (obs, next_obs))
+        row, previous = self.pos, (self.pos - 1) % self.buffer_size
+        continues = self._continues(obs)
+        if self.is_delayed:
+            self._check_order(obs, next_obs, continues)
+        started = np.flatnonzero(~continues)
+        if self.full:
+            self._free(row)
+        if self.size() > 0:
+            self._keep_tails(previous, started)
+
+        self.observations[row] = np.where(continues[:, None], self._next_states, obs["observation"])
+        self.steps[row] = np.where(continues, self.steps[previous] + 1, 0)
+        self.ages[row] = obs["delay"].reshape(self.n_envs) if self.is_delayed else 0
+        sent = next_obs["action_history"][:, -1] if self.max_delay > 0 else action
+        self.actions[row] = sent.reshape(self.n_envs, self.action_dim)
+        if self.is_delayed:  # else the name is the task's own
+            for i, info in enumerate(infos):
+                if EXECUTED in info:
+                    self.actions[row, i] = info[EXECUTED]
+        self.rewards[row] = reward
+        self.dones[row] = done
+        if self.handle_timeout_termination:
+            self.timeouts[row] = [info.get("TimeLimit.truncated", False) for info in infos]
+
+        self._next_states[:] = self._true_states(next_obs, infos)
+        self._next_ages[:] = next_obs["delay"].reshape(self.n_envs) if self.is_delayed else 0
+        self._expected = {key: np.array(value) for key, value in next_obs.items()}
+
+        self.pos += 1
+        if self.pos == self.buffer_size:
+            self.full = True
+            self.pos = 0
+
+    def _continues(self, obs: dict[str, np.ndarray]) -> np.ndarray:
+        """Tell for each environment whether ``obs`` goes on from the newest row: (n_envs,) bool."""
+        if self._expected is None:
+            return np.zeros(self.n_envs, bool)
+        same = [
+            np.all((obs[key] == self._expected[key]).reshape(self.n_envs, -1), axis=1) for key in self._expected
+        ]  # fails where training was interrupted and the environment reset
+        return np.logical_and.reduce(same) & (self.dones[self.pos - 1] == 0)
+
+    def knows_past(self, obs: np.ndarray | dict[str, np.ndarray]) -> np.ndarray:
+        """Tell for each environment whether a step from ``obs`` can be added: the newest step led there, or none did.
+
+        :param obs: as in :meth:`add`
+        :return: (n_envs,) bool
+        """
+        if not isinstance(obs, dict):
+            return np.ones(self.n_envs, bool)
+        return self._continues(obs) | self._starts(obs)
+
+    def _starts(self, obs: dict[str, np.ndarray]) -> np.ndarray:
+        """Tell for each environment whether ``obs`` can be the first of an episode: (n_envs,) bool."""
+        past = (obs[key].reshape(self.n_envs, -1) for key in ("delay", "action_history"))
+        return np.logical_and.reduce([np.all(part == 0, axis=1) for part in past])
+
+    def _check_order(self, obs: dict[str, np.ndarray], next_obs: dict[str, np.ndarray], continues: np.ndarray) -> None:
+        """:raises ValueError: for a transition that, as histories and ages tell, is out of order"""
+        history = obs["action_history"]
+        if not continues.all() and (joined := np.flatnonzero(~continues & ~self._starts(obs))).size:
+            env = joined[0]
+            raise ValueError(
+                f"The first observation of an episode must have age 0 and an empty past, but that of environment {env} "
+                f"has {np.any(history[env] != 0, axis=-1).sum()} actions sent before it and is "
+                f"{obs['delay'][env, 0]:.0f} steps old: transitions must be added in the order they happened. Empty or "
+                "replace a replay between two calls of learn(), which then starts new episodes, not during one."
+            )
+        differs = next_obs["action_history"][:, :-1] != history[:, 1:]
+        if differs.any():  # a step between the two was not added
+            raise ValueError(
+                f"The observation after the action of environment {np.argwhere(differs)[0, 0]} does not follow the "
+                "one before it: its action_history is not the same with one action more. Transitions must be added in "
+                "the order they happened, and each of them."
+            )
+
+    def _true_states(self, next_obs: dict[str, np.ndarray], infos: list[dict[str, Any]]) -> np.ndarray:
+        if not self.is_delayed:
+            return next_obs["observation"]
+        missing = [i for i, info in enumerate(infos) if UNDELAYED not in info]
+        if missing:
+            raise ValueError(
+                f"The info of environment {missing[0]} has no '{UNDELAYED}', without which the true state is unknown; "
+                "wrap the task in sb3_said.DelayedObservationWrapper."
+            )
+        return np.stack([info[UNDELAYED] for info in infos])
+
+    def _keep_tails(self, row: int, envs: np.ndarray) -> None:
+        for env in envs:
+            if not self._free_slots:
+                n_slots = len(self.tail_ages)
+                n_new = max(n_slots, 64)
+                new_states = np.zeros((n_new, self.tail_states.shape[1]), np.float32)
+                self.tail_states = np.concatenate([self.tail_states, new_states])
+                self.tail_ages = np.concatenate([self.tail_ages, np.zeros(n_new, np.int16)])
+                self._free_slots = list(range(n_slots + n_new - 1, n_slots - 1, -1))
+            slot = self._free_slots.pop()
+            self.tail_slots[row, env] = slot
+            self.tail_states[slot] = self._next_states[env]
+            self.tail_ages[slot] = self._next_ages[env]
+
+    def reset(self) -> None:
+        """Forget everything stored."""
+        super().reset()
+        self.tail_slots[:] = -1
+        self.tail_states, self.tail_ages, self._free_slots = self.tail_states[:0], self.tail_ages[:0], []
+        self._expected = None
+
+    def _free(self, row: int) -> None:
+        slots = self.tail_slots[row]
+        self._free_slots.extend(slots[slots >= 0].tolist())
+        slots[:] = -1
+
+    # ------------------------------------------------------------------------------------------------ sampling
+
+    def sample(  # type: ignore[override]
+        self, batch_size: int, env: VecNormalize | None = None
+    ) -> ReplayBufferSamples | DictReplayBufferSamples:
+        """Sample transitions uniformly, except the few oldest whose past has been overwritten.
+
+        :param batch_size: B
+        :param env: normalises observations and rewards
+        :raises ValueError: when the buffer is empty
+        """
+        if self.size() == 0:
+            raise ValueError("The replay buffer is empty; add transitions before sampling.")
+        rows = np.random.randint(0, self.size(), size=batch_size)
+        while self.full and (stale := (rows - self.pos) % self.buffer_size < self.max_delay).any():
+            rows[stale] = np.random.randint(0, self.size(), size=int(stale.sum()))
+        return self._get_samples(rows, env=env)
+
+    def _get_samples(  # type: ignore[override]
+        self, batch_inds: np.ndarray, env: VecNormalize | None = None
+    ) -> ReplayBufferSamples | DictReplayBufferSamples:
+        rows, envs = batch_inds, np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))
+        states = self.observations[rows, envs]  # (B, obs_dim)
+        next_states, next_ages = self._successors(rows, envs)
+        actions = self.actions[rows, envs]  # (B, act_dim)
+        # Only the dones that are not due to time limits
+        dones = (self.dones[rows, envs] * (1 - self.timeouts[rows, envs])).reshape(-1, 1)
+        rewards = self._normalize_reward(self.rewards[rows, envs].reshape(-1, 1), env)
+        if not self.is_delayed:
+            data = (self._normalize_obs(states, env), actions, self._normalize_obs(next_states, env), dones, rewards)
+            return ReplayBufferSamples(*(self.to_torch(np.asarray(part)) for part in data))
+
+        ages = self.ages[rows, envs]
+        if self.exchanged_ages > 0.0:
+            self._exchange(ages, next_ages, self.steps[rows, envs])
+        history = self._histories(rows, envs)  # (B, D, act_dim)
+        next_history = np.concatenate([history, actions[:, None]], axis=1)[:, 1:]
+        past = self.observations[(rows + 1 - next_ages) % self.buffer_size, envs]  # (B, obs_dim)
+        obs = {
+            "observation": self.observations[(rows - ages) % self.buffer_size, envs],
+            "action_history": history,
+            "delay": ages[:, None].astype(np.float32),
+        }
+        next_obs = {
+            "observation": np.where(next_ages[:, None] == 0, next_states, past),
+            "action_history": next_history,
+            "delay": next_ages[:, None].astype(np.float32),
+        }
+        return DictReplayBufferSamples(
+            observations=self._to_observation(obs, states, env),
+            actions=self.to_torch(actions),
+            next_observations=self._to_observation(next_obs, next_states, env),
+            dones=self.to_torch(dones),
+            rewards=self.to_torch(rewards),
+        )
+
+    def to_torch(self, array: np.ndarray, copy: bool = False) -> th.Tensor:
+        """Hand what was gathered on as a tensor; gathering has copied it, so SB3's second copy is spared."""
+        return super().to_torch(array, copy)
+
+    def _successors(self, rows: np.ndarray, envs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return s_{t+1} and its observation's age: (B, obs_dim), (B,)."""
+        next_rows = (rows + 1) % self.buffer_size
+        states, ages = self.observations[next_rows, envs], self.ages[next_rows, envs]
+        slots = self.tail_slots[rows, envs]
+        ended = slots >= 0
+        states[ended], ages[ended] = self.tail_states[slots[ended]], self.tail_ages[slots[ended]]
+        newest = rows == (self.pos - 1) % self.buffer_size
+        states[newest], ages[newest] = self._next_states[envs[newest]], self._next_ages[envs[newest]]
+        return states, ages
+
+    def _exchange(self, ages: np.ndarray, next_ages: np.ndarray, steps: np.ndarray) -> None:
+        """Give a part of the transitions the ages of others, in place, but none that reach before their episode.
+
+        A pair (age, next age) stays together: so ages change from step to step as they do in play. Ages that only the
+        start of an episode keeps small are not handed on, which leaves a fixed delay as it is.
+
+        :param ages: (B,)
+        :param next_ages: (B,)
+        :param steps: (B,) of each transition within its episode
+        """
+        takers = np.flatnonzero(np.random.random(len(ages)) < self.exchanged_ages)
+        givers = np.flatnonzero(ages < steps)
+        if givers.size:
+            drawn = np.random.choice(givers, takers.size)
+            ages[takers] = np.minimum(ages[drawn], steps[takers])
+            next_ages[takers] = np.minimum(next_ages[drawn], steps[takers] + 1)
+
+    def _histories(self, rows: np.ndarray, envs: np.ndarray) -> np.ndarray:
+        """Return the actions a_{t-D..t-1}, zeros before the episode: (B, D, act_dim)."""
+        back = np.arange(self.max_delay, 0, -1)  # (D,)
+        actions = self.actions[(rows[:, None] - back) % self.buffer_size, envs[:, None]]  # (B, D, act_dim)
+        actions[back > self.steps[rows, envs][:, None]] = 0.0
+        return actions
+
+    def _to_observation(
+        self, obs: dict[str, np.ndarray], states: np.ndarray, env: VecNormalize | None
+    ) -> dict[str, th.Tensor]:
+        if env is not None:
+            states = env.normalize_obs({**obs, "observation": states})["observation"]
+            obs = env.normalize_obs(obs)  # type: ignore[assignment]  # a dict for a dict
+        return {key: self.to_torch(value) for key, value in {**obs, UNDELAYED: states}.items()}
+
+    # ------------------------------------------------------------------------------------------------ windows
+
+    def window_source(
+        self,
+        newest_fraction: float = 1.0,
+        gamma: float = 0.99,
+        terminal_penalty: float | None = -100.0,
+        value_fn: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
+        env: VecNormalize | None = None,
+    ) -> WindowSource:
+        """Return every place a planner's window can start, over this buffer's own arrays.
+
+        The buffer must not grow while the source is in use.
+
+        :param newest_fraction: use only the newest part of the buffer (the paper's 20 % is 0.2), in (0, 1]
+        :param gamma: discount of the windows' values
+        :param terminal_penalty: replaces the reward of a terminating step in the values (paper, Table 5); None keeps it
+        :param value_fn: (states (B, obs_dim), actions (B, act_dim)) -> (B,), bootstraps where an episode was cut off;
+            without it an episode is taken to go on at its average reward
+        :param env: normalises states, as the expert's observations are
+        :raises ValueError: when the buffer is empty, the fraction is not in (0, 1], or gamma is 1 without ``value_fn``
+        """
+        if not 0.0 < newest_fraction <= 1.0:
+            raise ValueError(f"newest_fraction is a part of the buffer in (0, 1], got {newest_fraction}.")
+        if self.size() == 0:
+            raise ValueError("The replay buffer is empty; collect transitions before training a planner.")
+        n_rows = max(int(self.size() * newest_fraction), 1)
+        rows = (self.pos - n_rows + np.arange(n_rows)) % self.buffer_size  # (T,), oldest first
+        ends = self.tail_slots[rows] >= 0  # (T, n_envs)
+        ends[-1] = True
+        last = np.where(ends, np.arange(n_rows)[:, None], n_rows)
+        last = np.minimum.accumulate(last[::-1], axis=0)[::-1]  # (T, n_envs): where each episode ends
+
+        terminated = (self.dones[rows] * (1 - self.timeouts[rows])) > 0
+        rewards = self.rewards[rows]
+        if terminal_penalty is not None:
+            rewards = np.where(terminated, terminal_penalty, rewards)
+        if value_fn is None:
+            tails = average_reward_tail(rewards, ends, gamma)
+        else:
+            tails = np.zeros_like(rewards)
+            t, e = np.nonzero(ends & ~terminated)
+            tails[t, e] = value_fn(self.observations[rows[t], e], self.actions[rows[t], e])
+        values = normalise_values(discounted_values(rewards, terminated, ends, tails, gamma))
+
+        states = self.observations
+        if env is not None and self.is_delayed:
+            raw = {key: np.zeros((1, *space.shape), np.float32) for key, space in self.observation_space.items()}  # type: ignore[attr-defined]
+            states = env.normalize_obs({**raw, "observation": states})["observation"]
+        elif env is not None:
+            states = env.normalize_obs(states)  # type: ignore[assignment]  # an array for an array
+        episodes = last + np.arange(self.n_envs) * n_rows  # unique for each environment and end
+        grid = np.broadcast_to(rows[:, None], ends.shape), np.broadcast_to(np.arange(self.n_envs), ends.shape)
+        flat = (*grid, last - np.arange(n_rows)[:, None] + 1, values, episodes)
+        return WindowSource(
+            th.from_numpy(np.asarray(states, np.float32)),
+            th.from_numpy(self.actions),
+            *(th.from_numpy(x.flatten()) for x in flat),  # a copy: the grid is read-only
+        )
+
+    def sample_windows(self, batch_size: int, length: int, generator: th.Generator | None = None) -> Windows:
+        """Sample planner windows uniformly over all stored steps.
+
+        :param batch_size: B
+        :param length: L
+        :param generator: CPU generator; torch's global one by default
+        """
+        return self.window_source().sample(batch_size, length, generator)
+
+    # ------------------------------------------------------------------------------------------------ saving
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything stored, as arrays and numbers; unused rows are left out.
+
+        The arrays are this buffer's own memory: write them out, or copy them, before adding on.
+        """
+        return {
+            "pos": self.pos,
+            "full": self.full,
+            "free_slots": np.array(self._free_slots, np.int64),
+            "expected": self._expected,
+            "next_states": self._next_states,
+            "next_ages": self._next_ages,
+            "tail_states": self.tail_states,
+            "tail_ages": self.tail_ages,
+            **{name: getattr(self, name)[: self.size()] for name in _ROW_ARRAYS},
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what ``state_dict`` returned.
+
+        :raises ValueError: when it came from a buffer of another shape
+        """
+        size = len(state["rewards"])
+        fits = size == self.buffer_size if state["full"] else size == state["pos"] <= self.buffer_size
+        fits = fits and all(state[name].shape[1:] == getattr(self, name).shape[1:] for name in _ROW_ARRAYS)
+        if not fits or not self._fits(state["expected"]):
+            raise ValueError(
+                f"A stored replay of shape {state['observations'].shape} does not fit a buffer of shape "
+                f"{self.observations.shape}; use the buffer_size, n_envs, task and max_delay it was made with."
+            )
+        self.pos, self.full = state["pos"], state["full"]
+        self._free_slots = state["free_slots"].tolist()
+        self._expected = state["expected"]
+        self._next_states, self._next_ages = state["next_states"].copy(), state["next_ages"].copy()
+        self.tail_states, self.tail_ages = state["tail_states"].copy(), state["tail_ages"].copy()
+        for name in _ROW_ARRAYS:
+            getattr(self, name)[:size] = state[name]
+        self.tail_slots[size:] = -1  # of whatever was stored before
+
+    def _fits(self, expected: dict[str, np.ndarray] | None) -> bool:
+        """Tell whether the observation that would continue a stored replay is of this buffer's task."""
+        space = self.observation_space
+        boxes = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
+        sizes = {key: self.n_envs * int(np.prod(box.shape)) for key, box in boxes.items()}  # type: ignore[arg-type]
+        return expected is None or {key: x.size for key, x in expected.items()} == sizes

@@ -1,0 +1,184 @@
+"""Watch a trained agent, in a window or as a video."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+from sb3_said.evaluation import rollout
+from sb3_said.zoo.manager import add_delay, read_delay
+from sb3_said.zoo.runs import ANSWERS, answering, load_run
+
+EPILOG = """\
+examples:
+  # three episodes in a window
+  python scripts/enjoy.py logs/said/Hopper-v5-delay4_1 --episodes 3
+
+  # a video at real speed, on a machine without a display
+  python scripts/enjoy.py logs/said/Hopper-v5-delay4_1 --record hopper.mp4
+
+  # the expert from the same starts, as a GIF
+  python scripts/enjoy.py logs/said/Hopper-v5-delay4_1 --answer expert --record hopper_expert.gif
+
+Without a display, MuJoCo draws through EGL (Debian, Ubuntu: apt-get install libegl1 libgl1-mesa-dri), or in software
+with MUJOCO_GL=osmesa (libosmesa6). Videos need the extra sb3_said[video].
+A run folder's YAML can run code (rl_zoo3 reads it so): open only folders that you trust.
+"""
+
+
+def make_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("run", metavar="RUN_OR_ZIP", help="run folder of a training, or an agent's .zip")
+    parser.add_argument("--record", type=Path, metavar="FILE", help="write a video (.mp4 or .gif) instead of a window")
+    parser.add_argument("--fps", type=int, default=25, help="frames a second of the video; it plays in real time, "
+                        "by leaving out steps (default: 25)")  # fmt: skip
+    parser.add_argument("--episodes", type=int, default=1, help="whole episodes (default: 1)")
+    parser.add_argument("--seed", type=int, default=10_000, help="reset seed of the first episode (default: 10000)")
+    parser.add_argument("--answer", choices=ANSWERS, help="who acts in a SAID agent (default: the agent)")
+    parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the best")
+    parser.add_argument("--algo", help="algorithm of a .zip without its run folder")
+    parser.add_argument("--env", help="task to play (default: the trained one)")
+    add_delay(parser, default="the trained one")
+    parser.add_argument("--device", default="auto", help="torch device (default: auto)")
+    return parser
+
+
+class CannotDraw(RuntimeError):
+    """The task cannot be drawn on this machine.
+
+    :param cause: what the graphics library said; MuJoCo's and pygame's backends each fail in their own way
+    """
+
+    def __init__(self, cause: Exception):
+        super().__init__(
+            f"The task could not be drawn (MUJOCO_GL={os.environ.get('MUJOCO_GL', 'unset')}): {cause!r}\n"
+            "MuJoCo needs a GL library; on Debian or Ubuntu: apt-get install libegl1 libgl1-mesa-dri and "
+            "MUJOCO_GL=egl, or apt-get install libosmesa6 and MUJOCO_GL=osmesa. Other tasks may need pygame."
+        )
+
+
+def follow(env: gym.Env[Any, Any]) -> None:
+    """Use a MuJoCo task's own tracking camera, where the default one stays behind while the robot runs away."""
+    renderer = getattr(getattr(env, "unwrapped", None), "mujoco_renderer", None)
+    if renderer is not None and renderer.camera_id in (None, -1):
+        import mujoco
+
+        renderer.camera_id = mujoco.mj_name2id(renderer.model, mujoco.mjtObj.mjOBJ_CAMERA, "track")  # -1: has none
+
+
+class Video:
+    """Writes the steps of a task to an mp4 or a GIF that plays in real time, by leaving out steps.
+
+    :param path: ending in .mp4 or .gif
+    :param fps: frames a second, at most one for each control step
+    """
+
+    def __init__(self, path: Path, fps: int):
+        self.path = path
+        self.fps: float = fps
+        self.frames = 0
+        self._steps = 0
+        self._writer: Any = None
+
+    def on_step(self, env: gym.Env[Any, Any]) -> None:
+        """Take a frame, if one is due.
+
+        :raises CannotDraw: without a working GL library
+        """
+        rate = env.metadata.get("render_fps", self.fps)  # control steps a second
+        self.fps = min(self.fps, rate)
+        due = self._steps * self.fps / rate
+        self._steps += 1
+        if due < self.frames:
+            return
+        if self._writer is None:
+            follow(env)
+        try:
+            frame: Any = env.render()
+        except Exception as error:
+            raise CannotDraw(error) from error
+        if self._writer is None:
+            self._writer = self._open()
+        self._writer.append_data(frame)
+        self.frames += 1
+
+    def close(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+
+    def _open(self) -> Any:
+        import imageio
+
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        if self.path.suffix == ".gif":
+            return imageio.get_writer(self.path, mode="I", duration=1000 / self.fps, loop=0)
+        return imageio.get_writer(self.path, fps=self.fps)
+
+
+def check_can_record() -> None:
+    """Fail before an agent is loaded, with what to install.
+
+    :raises ModuleNotFoundError: without imageio
+    :raises CannotDraw: when MuJoCo cannot load the library that MUJOCO_GL names
+    """
+    if any(find_spec(package) is None for package in ("imageio", "imageio_ffmpeg")):
+        raise ModuleNotFoundError('Videos need imageio and imageio-ffmpeg: pip install "sb3_said[video]"')
+    try:
+        import mujoco  # noqa: F401  # loads the GL library
+    except Exception as error:
+        raise CannotDraw(error) from error
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = make_parser()
+    args = parser.parse_args(argv)
+    has_display = not sys.platform.startswith("linux") or bool(
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    )
+    if args.episodes < 1 or args.fps < 1:
+        parser.error("--episodes and --fps must be at least 1")
+    if args.record is None and not has_display:
+        parser.error("there is no display here to open a window on: give --record FILE.mp4")
+    if args.record is not None and args.record.suffix not in (".mp4", ".gif"):
+        parser.error(f"--record takes a file ending in .mp4 or .gif, got {args.record}")
+    if not has_display:
+        os.environ.setdefault("MUJOCO_GL", "egl")
+    try:
+        if args.record is not None:
+            check_can_record()
+        render_mode = "human" if args.record is None else "rgb_array"
+        run = load_run(args.run, args.algo, args.env, read_delay(args.delay), args.device, {"render_mode": render_mode})
+        context = answering(run.model, args.answer)
+    except ValueError as error:
+        parser.error(str(error))
+    except (CannotDraw, ModuleNotFoundError) as error:
+        parser.exit(1, f"{error}\n")
+
+    video = None if args.record is None else Video(args.record, args.fps)
+    try:
+        with context:
+            rollout(
+                run.model,
+                run.make_env,
+                args.episodes,
+                args.seed,
+                deterministic=not args.stochastic,
+                normalize=run.normalize,
+                on_step=None if video is None else video.on_step,
+                on_episode=lambda i, ret, length: print(f"seed {args.seed + i}: return {ret:,.1f} in {length} steps"),
+            )
+    except CannotDraw as error:
+        parser.exit(1, f"{error}\n")
+    finally:
+        if video is not None:
+            video.close()
+    if video is not None:
+        print(f"Wrote {args.record}: {video.frames} frames at {video.fps:g} a second")

@@ -1,0 +1,145 @@
+"""Measure a trained agent: mean return over whole seeded episodes, and how long a decision takes."""
+
+from __future__ import annotations
+
+import argparse
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch as th
+from tqdm import tqdm
+
+from sb3_said.evaluation import Summary, collect_observations, measure_latency, plots, rollout
+from sb3_said.files.atomic import write_json
+from sb3_said.zoo.manager import add_delay, read_delay
+from sb3_said.zoo.runs import LoadedRun, answering, answers, load_run, origin
+
+EPILOG = """\
+examples:
+  # 20 episodes of the planner, and of the expert beside it; writes evaluation.json into the run folder
+  python scripts/evaluate.py logs/said/Hopper-v5-delay4_1
+
+  # the checkpoint that did best in training, with a plot
+  python scripts/evaluate.py logs/said/Hopper-v5-delay4_1/best_model.zip --plot hopper.png
+
+  # the same agent under a shorter delay than it was built for
+  python scripts/evaluate.py logs/said/Hopper-v5-delay4_1 --delay 2 --json hopper_d2.json
+
+  # an agent that came without its run folder
+  python scripts/evaluate.py hopper.zip --algo said --env Hopper-v5 --delay 4
+
+Episode i starts from reset seed --seed + i, so that two agents meet the same starts, and --n-envs changes only the
+speed. Returns are undiscounted sums of the task's own rewards. Decision latency is measured apart from the episodes,
+one decision at a time, from NumPy observation to NumPy action.
+A run folder's YAML can run code (rl_zoo3 reads it so): open only folders that you trust.
+"""
+
+
+def make_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("run", metavar="RUN_OR_ZIP", help="run folder of a training, or an agent's .zip")
+    parser.add_argument("--episodes", type=int, default=20, help="whole episodes for each answer (default: 20)")
+    parser.add_argument("--seed", type=int, default=10_000, help="reset seed of the first episode (default: 10000)")
+    parser.add_argument("--n-envs", type=int, default=8, help="episodes played side by side (default: 8)")
+    parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the best")
+    parser.add_argument("--algo", help="algorithm of a .zip without its run folder")
+    parser.add_argument("--env", help="task to play (default: the trained one)")
+    add_delay(parser, default="the trained one")
+    parser.add_argument("--latency-calls", type=int, default=200, help="decisions to time, 0 for none (default: 200)")
+    parser.add_argument("--json", type=Path, help="where to write the numbers (default: RUN/evaluation.json)")
+    parser.add_argument(
+        "--plot", type=Path, help="draw returns, and the training curves there are, to this .png or .pdf"
+    )
+    parser.add_argument("--device", default="auto", help="torch device (default: auto)")
+    parser.add_argument("--num-threads", type=int, help="torch threads (default: torch's own choice)")
+    return parser
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = make_parser()
+    args = parser.parse_args(argv)
+    if args.episodes < 1 or args.n_envs < 1 or args.latency_calls < 0:
+        parser.error("--episodes and --n-envs must be at least 1, --latency-calls at least 0")
+    if args.num_threads is not None:
+        th.set_num_threads(args.num_threads)
+    try:
+        if args.plot is not None:
+            plots.panels()  # without matplotlib, fail now and not after the episodes
+        run = load_run(args.run, args.algo, args.env, read_delay(args.delay), args.device)
+    except ValueError as error:
+        parser.error(str(error))
+    except ImportError as error:
+        parser.exit(1, f"{error}\n")
+
+    last_seed = args.seed + args.episodes - 1
+    print(f"{run.info['algo']} on {run.info['env']}, delay {run.info['delay']}, reset seeds {args.seed}..{last_seed}")
+    who: list[str | None] = [*answers(run.model)] or [None]
+    summaries = [evaluate(run, answer, args) for answer in who]
+    print_table(summaries)
+
+    target = args.json or run.folder / "evaluation.json"
+    settings = {
+        "n_episodes": args.episodes, "seed": args.seed, "n_envs": args.n_envs, "deterministic": not args.stochastic
+    }  # fmt: skip
+    document = {
+        **run.info,
+        **settings,
+        "results": [summary.to_dict() for summary in summaries],
+        "origin": origin(run),
+    }
+    write_json(target, document)
+    print(f"Wrote {target}")
+    if args.plot is not None:
+        draw(args.plot, summaries, run.folder)
+        print(f"Wrote {args.plot}")
+
+
+def evaluate(run: LoadedRun, answer: str | None, args: argparse.Namespace) -> Summary:
+    """Play the episodes and time the decisions of one answer."""
+    label = answer or run.info["algo"]
+    deterministic = not args.stochastic
+    with answering(run.model, answer), tqdm(total=args.episodes, desc=label, unit="episode", leave=False) as bar:
+        played = rollout(
+            run.model,
+            run.make_env,
+            args.episodes,
+            args.seed,
+            args.n_envs,
+            deterministic,
+            run.normalize,
+            on_episode=lambda *_: bar.update(),
+        )
+        latency = None
+        if args.latency_calls:
+            observations = collect_observations(run.make_env, min(args.latency_calls, 100), args.seed)
+            latency = measure_latency(run.model, observations, args.latency_calls, deterministic, run.normalize)
+    return Summary.from_episodes(label, played.returns, played.lengths, latency)
+
+
+def print_table(summaries: list[Summary]) -> None:
+    """Print one line for each answer."""
+    print(f"{'':10} {'mean return':>12} {'95 % interval':>24} {'length':>8}   decision latency")
+    for s in summaries:
+        interval = f"[{s.mean_return.low:,.1f}, {s.mean_return.high:,.1f}]"
+        speed = "not measured" if s.latency is None else str(s.latency)
+        print(f"{s.label:10} {s.mean_return.value:12,.1f} {interval:>24} {s.mean_length.value:8,.1f}   {speed}")
+
+
+def draw(path: Path, summaries: list[Summary], folder: Path) -> None:
+    """Draw the returns, and beside them the training curves whose files lie in the run folder."""
+    drawings: list[Any] = [partial(plots.plot_returns, summaries)]
+    if any(folder.glob("*monitor.csv")):
+        drawings.append(partial(plots.plot_learning_curve, folder))
+    headers = [path.read_text().split("\n", 1)[0] for path in folder.glob("progress*.csv")]
+    drawings += [
+        partial(plots.plot_planner_errors, folder, kind)
+        for kind in ("present", "action")
+        if any(f"planner/{kind}_error" in header for header in headers)
+    ]
+    axes = plots.panels(len(drawings))
+    for ax, drawing in zip(axes, drawings, strict=True):
+        drawing(ax=ax)
+    plots.save(axes[0], path)

@@ -1,0 +1,242 @@
+"""Open a trained agent and its task again, from an rl_zoo3 log folder or a single file."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shlex
+import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, get_args
+
+import gymnasium as gym
+import torch as th
+import yaml
+from gymnasium import spaces
+from rl_zoo3.utils import get_saved_hyperparams, get_wrapper_class
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_said import DelayedSAC
+from sb3_said.delays import DelayProcess, FixedDelay
+from sb3_said.delays.ages import ages_of
+from sb3_said.delays.space import has_state_history
+from sb3_said.evaluation.rollout import Observation
+from sb3_said.said.policies import Answer
+from sb3_said.zoo.manager import ALGOS, WRAPPER, Delay, largest_delay
+
+ANSWERS = get_args(Answer)
+
+
+@dataclass(frozen=True)
+class LoadedRun:
+    """A trained agent, ready to play."""
+
+    model: BaseAlgorithm
+    make_env: Callable[[], gym.Env[Any, Any]]
+    """makes the task as it was trained on, delay included"""
+    normalize: Callable[[Observation], Observation] | None
+    """VecNormalize's frozen normalisation of batched observations, where training used it"""
+    folder: Path
+    """of the run, for results"""
+    info: dict[str, Any]
+    """what was loaded, in JSON types: algo, env, delay, file, trained_steps"""
+
+
+def load_run(
+    path: str | Path,
+    algo: str | None = None,
+    env_id: str | None = None,
+    delay: Delay = None,
+    device: str = "auto",
+    env_kwargs: dict[str, Any] | None = None,
+) -> LoadedRun:
+    """Open a run.
+
+    A run folder's YAML is read the way rl_zoo3 reads it, which can run code: open only folders that you trust. A
+    ``.zip`` on its own, outside a run folder, is opened by its algorithm's ``load`` alone.
+
+    :param path: a run folder such as ``logs/said/Hopper-v5-delay4_1``, or an agent's ``.zip``
+    :param algo: name of the algorithm; read from the run folder where there is one
+    :param env_id: task to play; the one of the run folder by default
+    :param delay: observation delay to play under; the trained one by default, and outside a run folder the largest that
+        the agent was built for
+    :param device: torch device
+    :param env_kwargs: more arguments for ``gymnasium.make``, such as ``render_mode``
+    :raises ValueError: when the files do not say what to load, or the agent does not fit the task
+    """
+    file, params = _find(Path(path))
+    hyperparams, args = _read_params(params)
+    algo = algo or args.get("algo")
+    env_id = env_id or getattr(args.get("env"), "gym_id", args.get("env"))
+    if algo not in ALGOS:
+        raise ValueError(f"The algorithm of {file} is not known ({algo}): give --algo, one of {', '.join(ALGOS)}.")
+    if env_id is None:
+        raise ValueError(f"The task of {file} is not known, since no run folder is around it: give --env.")
+    for key in ("frame_stack", "vec_env_wrapper"):
+        if hyperparams.get(key):
+            raise ValueError(f"{file} was trained with {key}={hyperparams[key]}, which cannot be played here.")
+
+    model = ALGOS[algo].load(file, device=device)
+    wrappers = hyperparams.get("env_wrapper") or []
+    wrappers = list(wrappers) if isinstance(wrappers, list) else [wrappers]
+    if delay is not None or params is None:
+        wrappers = _with_delay(wrappers, delay, model)
+    wrap = get_wrapper_class({"env_wrapper": wrappers}) if wrappers else None
+    kwargs = {**hyperparams.get("env_kwargs", {}), **(args.get("env_kwargs") or {}), **(env_kwargs or {})}
+
+    def make_env() -> gym.Env[Any, Any]:
+        env: gym.Env[Any, Any] = gym.make(env_id, **kwargs)
+        return env if wrap is None else wrap(env)
+
+    env = make_env()
+    _check_spaces(model, env, file)
+    delay_process = env.get_wrapper_attr("process") if env.has_wrapper_attr("process") else FixedDelay(0)
+    if isinstance(model, DelayedSAC):
+        model.check_ages(ages_of(env))
+    env.close()
+    info = {
+        "algo": algo,
+        "env": env_id,
+        "delay": delay_name(delay_process),
+        "file": str(file),
+        "trained_steps": model.num_timesteps,
+    }
+    return LoadedRun(model, make_env, _load_normalize(params, hyperparams, make_env), file.parent, info)
+
+
+def delay_name(process: DelayProcess) -> int | str:
+    """Return the number of a fixed delay, and another process written out."""
+    return process.delay if isinstance(process, FixedDelay) else str(process)
+
+
+def answers(model: BaseAlgorithm) -> list[str]:
+    """Return who can answer for a model by name: SAID's expert, and its planner once that is trained."""
+    if not hasattr(model.policy, "answering"):
+        return []
+    return [who for who in ANSWERS if who != "planner" or model.policy.planner_is_trained]
+
+
+def answering(model: BaseAlgorithm, answer: str | None) -> AbstractContextManager[Any]:
+    """Let one of ``answers(model)`` answer inside the context; None leaves the model as it is.
+
+    :raises ValueError: for another answer
+    """
+    if answer is None:
+        return nullcontext()
+    if answer not in answers(model):
+        raise ValueError(
+            f"This {type(model).__name__} cannot answer as {answer!r}: only a SAID agent has an expert, "
+            "and a planner once that is trained."
+        )
+    context: AbstractContextManager[Any] = model.policy.answering(answer)  # type: ignore[operator]
+    return context
+
+
+def longest_delay(model: BaseAlgorithm) -> int | None:
+    """Return the largest delay that an agent was built for, None for one that reads undelayed observations."""
+    space = model.observation_space
+    if not isinstance(space, spaces.Dict) or "action_history" not in space.spaces:
+        return None
+    return int(space["action_history"].shape[0])  # type: ignore[index]  # a Box has a shape
+
+
+def origin(run: LoadedRun) -> dict[str, Any]:
+    """Say what a reader needs to judge and repeat the numbers: command, date, machine, versions."""
+    packages = ("sb3_said", "stable_baselines3", "torch", "gymnasium", "mujoco", "numpy")
+    return {
+        "command": shlex.join(["python", *sys.argv]),
+        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} CPU cores",
+        "device": str(run.model.device),
+        "torch_threads": th.get_num_threads(),
+        "versions": {"python": platform.python_version(), **{package: version_of(package) for package in packages}},
+    }
+
+
+def version_of(package: str) -> str:
+    """Return the installed version; a clone can run without being installed."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def _find(path: Path) -> tuple[Path, Path | None]:
+    """Return the agent's file, and the folder of its run's YAML if it lies in a run folder."""
+    if path.is_file():
+        params = sorted(path.parent.glob("*/args.yml"))
+        return path, params[0].parent if len(params) == 1 else None
+    if not path.is_dir():
+        raise ValueError(f"{path} does not exist; give a run folder such as logs/said/Hopper-v5-delay4_1 or a .zip.")
+    params = sorted(path.glob("*/args.yml"))
+    if len(params) != 1:
+        runs = sorted(str(p.parents[1]) for p in path.glob("**/args.yml"))
+        hint = f"it holds the runs {', '.join(runs)}" if runs else "rl_zoo3 makes one with every training"
+        raise ValueError(f"{path} is not a run folder with one */args.yml: {hint}.")
+    candidates = [path / f"{params[0].parent.name}.zip", path / "best_model.zip"]
+    for file in candidates:
+        if file.is_file():
+            return file, params[0].parent
+    raise ValueError(f"{path} has no finished agent: neither {candidates[0].name} nor {candidates[1].name}.")
+
+
+def _read_params(params: Path | None) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return a run's hyper-parameters and command-line arguments; empty without a run folder."""
+    if params is None:
+        return {}, {}
+    hyperparams, _ = get_saved_hyperparams(str(params), test_mode=True)
+    # rl_zoo3 writes Python objects into this file, so that no safe loader reads it.
+    args = yaml.load((params / "args.yml").read_text(), Loader=yaml.UnsafeLoader)
+    return dict(hyperparams), dict(args)
+
+
+def _with_delay(wrappers: list[Any], delay: Delay, model: BaseAlgorithm) -> list[Any]:
+    """Set the delay to play under, keeping the length of the action history that the model reads."""
+    max_delay = longest_delay(model)
+    if max_delay is None:
+        if largest_delay(delay) > 0:
+            raise ValueError(
+                f"This agent reads {model.observation_space}, not delayed observations: "
+                f"it cannot play with --delay {delay}."
+            )
+        return wrappers
+    if largest_delay(delay) > max_delay:
+        raise ValueError(f"This agent was built for delays 0..{max_delay}, got --delay {delay}.")
+    kwargs: dict[str, Any] = {"delay": max_delay if delay is None else delay, "max_delay": max_delay}
+    if has_state_history(model.observation_space):
+        kwargs["state_history"] = True
+    names = [next(iter(w)) if isinstance(w, dict) else w for w in wrappers]
+    delayed = [str(name).endswith(WRAPPER.rsplit(".", 1)[1]) for name in names]
+    if not any(delayed):
+        return [*wrappers, {WRAPPER: kwargs}]
+    return [
+        {name: {**(w[name] if isinstance(w, dict) else {}), **kwargs}} if is_delay else w
+        for w, name, is_delay in zip(wrappers, names, delayed, strict=True)
+    ]
+
+
+def _check_spaces(model: BaseAlgorithm, env: gym.Env[Any, Any], file: Path) -> None:
+    def shapes(space: spaces.Space[Any]) -> Any:
+        return {key: s.shape for key, s in space.spaces.items()} if isinstance(space, spaces.Dict) else space.shape
+
+    for what in ("observation_space", "action_space"):
+        expected, given = shapes(getattr(model, what)), shapes(getattr(env, what))
+        if expected != given:
+            raise ValueError(f"{file} expects {what} shapes {expected}, the task has {given}: check --env and --delay.")
+
+
+def _load_normalize(
+    params: Path | None, hyperparams: dict[str, Any], make_env: Callable[[], gym.Env[Any, Any]]
+) -> Callable[[Observation], Observation] | None:
+    if params is None or not hyperparams.get("normalize"):
+        return None
+    statistics = VecNormalize.load(str(params / "vecnormalize.pkl"), DummyVecEnv([make_env]))
+    statistics.close()
+    statistics.training = False
+    return statistics.normalize_obs

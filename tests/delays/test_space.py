@@ -1,0 +1,39 @@
+"""Which spaces are served, what is read off them, and why others are refused."""
+
+import itertools
+
+import numpy as np
+import pytest
+from counting_task import OBS_DIM, CountingTask
+from gymnasium import spaces
+
+from sb3_said.delays import DelayedObservationWrapper
+from sb3_said.delays.space import check_spaces, has_state_history
+
+
+@pytest.mark.parametrize(
+    ("observation_space", "action_space", "reason"),
+    [
+        (spaces.Box(-1, 1, (3, 3)), spaces.Box(-1, 1, (2,)), "FlattenObservation"),
+        (spaces.Discrete(3), spaces.Box(-1, 1, (2,)), "FlattenObservation"),
+        (spaces.Dict(observation=spaces.Box(-1, 1, (3,))), spaces.Box(-1, 1, (2,)), "wrap the task"),
+        (spaces.Box(-1, 1, (3,)), spaces.Discrete(2), "RescaleAction"),
+        (spaces.Box(-1, 1, (3,)), spaces.Box(-1, np.inf, (2,)), "RescaleAction"),
+        (spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (2, 2)), "RescaleAction"),
+    ],
+)
+def test_other_spaces_are_refused_with_a_reason(observation_space, action_space, reason):
+    with pytest.raises(ValueError, match=reason):
+        check_spaces(observation_space, action_space)
+
+
+@pytest.mark.parametrize(("delay", "max_delay"), [(0, 0), (3, 3), ((1, 2), 2)])
+@pytest.mark.parametrize("state_history", [False, True])
+def test_a_delayed_task_tells_its_states_and_its_largest_delay(delay, max_delay, state_history):
+    task = CountingTask(itertools.count(), max_length=3)
+    env = DelayedObservationWrapper(task, delay, state_history=state_history)
+    states = spaces.Box(-np.inf, np.inf, (OBS_DIM,), np.float32)
+    assert check_spaces(env.observation_space, env.action_space) == (states, max_delay)
+    assert has_state_history(env.observation_space) == state_history
+    assert check_spaces(task.observation_space, task.action_space) == (states, 0)
+    assert not has_state_history(task.observation_space)

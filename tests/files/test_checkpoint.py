@@ -1,0 +1,294 @@
+"""Checkpoints: a run that was killed goes on from one as if from a save in a game."""
+
+import copy
+import random
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from kill import Kill, Killed
+from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
+from sb3_said.files import checkpoint
+from sb3_said.files.agents import load_tree, save_tree
+from sb3_said.files.checkpoint import (
+    CHECKPOINT_NAME,
+    TrainingCheckpointCallback,
+    random_state,
+    restore_random_state,
+    restore_training,
+    training_state,
+)
+
+PLANNER = {"d_model": 32, "depth": 1, "horizon": 3, "batch_size": 16, "sampling_steps": 2, "n_candidates": 3}
+
+
+def delayed():
+    return DelayedObservationWrapper(gym.make("Pendulum-v1", max_episode_steps=15), 2)
+
+
+def normalized(n_envs=2):
+    return VecNormalize(make_vec_env(delayed, n_envs=n_envs, seed=0), norm_obs_keys=["observation"])
+
+
+def make(env=None, cls=DelayedSAC, **kwargs):
+    arguments = {"learning_starts": 20, "batch_size": 16, "buffer_size": 300, "seed": 0, "device": "cpu"}
+    if cls is SAID:
+        arguments |= {"planner_kwargs": PLANNER, "planner_gradient_steps": 4, "planner_train_freq": 40}
+    env = delayed() if env is None else env
+    return cls("MlpPolicy", env, **(arguments | {"policy_kwargs": {"net_arch": [16]}} | kwargs))
+
+
+def evaluation(folder, env=None):
+    env = Monitor(delayed()) if env is None else env
+    return EvalCallback(env, eval_freq=20, n_eval_episodes=2, log_path=str(folder / "evaluations"), verbose=0)
+
+
+def run_and_kill(model, folder, at=70, save_freq=50, callbacks=()):
+    with pytest.raises(Killed):
+        model.learn(100, [*callbacks, TrainingCheckpointCallback(folder, save_freq), Kill(at)])
+    return folder / CHECKPOINT_NAME
+
+
+def everything(model):
+    """Return what decides how a run goes on, copied."""
+    state = training_state(model)
+    del state["random"]
+    return copy.deepcopy(state)
+
+
+def assert_same(first, second):
+    if isinstance(first, dict):
+        assert first.keys() == second.keys()
+        for key in first:
+            assert_same(first[key], second[key])
+    elif isinstance(first, (list, tuple)):
+        assert len(first) == len(second)
+        for one, other in zip(first, second, strict=True):
+            assert_same(one, other)
+    elif isinstance(first, (np.ndarray, th.Tensor)):
+        np.testing.assert_array_equal(np.asarray(first), np.asarray(second))
+    else:
+        assert first == second
+
+
+# ---------------------------------------------------------------------------------------------------- resuming
+
+
+@pytest.mark.parametrize(
+    ("make_env", "kwargs"),
+    [
+        (delayed, {}),
+        (normalized, {"ent_coef": 0.2, "gradient_steps": 2}),
+        (lambda: gym.make("Pendulum-v1", max_episode_steps=15), {"use_sde": True}),
+        (delayed, {"cls": SAID}),
+        (normalized, {"cls": SAID, "buffer_size": 80}),
+    ],
+    ids=["DelayedSAC", "VecNormalize", "gSDE, plain", "SAID", "SAID, VecNormalize, full buffer"],
+)
+def test_two_resumes_from_one_checkpoint_are_the_same(make_env, kwargs, tmp_path):
+    path = run_and_kill(make(make_env(), **kwargs), tmp_path)
+    ends = []
+    for noise in (1, 2):
+        np.random.seed(noise), th.manual_seed(noise), random.seed(noise)
+        model = make(make_env(), **kwargs)
+        restore_training(model, path)
+        assert model.num_timesteps == 50
+        model.learn(50, reset_num_timesteps=False)
+        assert model.num_timesteps == 100 and model._total_timesteps == 100
+        ends.append((model, everything(model)))
+    assert_same(ends[0][1], ends[1][1])
+    assert ends[0][1]["counters"]["_n_updates"] > 0
+
+
+def test_a_checkpoint_holds_the_whole_run(tmp_path):
+    model, callback = make(normalized()), evaluation(tmp_path, normalized(1))
+    path = run_and_kill(model, tmp_path, at=72, save_freq=70, callbacks=[callback])  # killed one step later
+    resumed, callback_again = make(normalized(), seed=9), evaluation(tmp_path, normalized(1))
+    before = everything(resumed)
+    restore_training(resumed, path, CallbackList([callback_again, TrainingCheckpointCallback(tmp_path, 70)]))
+    state = load_tree(path)
+    after = everything(resumed)
+    for part in ("parameters", "variables", "counters", "replay_buffer", "vec_normalize"):
+        assert_same(after[part], state[part])
+        with pytest.raises(AssertionError):  # it was another model before
+            assert_same(before[part], state[part])
+    optimizer = resumed.actor.optimizer.state_dict()["state"]
+    assert optimizer[0]["step"] == resumed._n_updates == 25  # a rollout is a step of two environments
+    assert callback_again.evaluations_timesteps == callback.evaluations_timesteps == [40]
+    assert_same(callback_again.evaluations_results, callback.evaluations_results)
+    assert callback_again.best_mean_reward == callback.best_mean_reward > -np.inf
+    assert callback_again.n_calls == 35
+    python, numpy, torch = random.random(), np.random.rand(), th.rand(1)
+    restore_random_state(state["random"])
+    assert (python, numpy, torch) == (random.random(), np.random.rand(), th.rand(1))
+
+
+def test_random_states_come_back(tmp_path):
+    random.gauss(0, 1)  # Python keeps a second number for the next call
+    np.random.normal()  # so does NumPy
+    save_tree(tmp_path / "random", random_state())
+
+    def draw():
+        return random.gauss(0, 1), random.random(), np.random.normal(), np.random.rand(), th.rand(3).tolist()
+
+    expected = draw()
+    assert draw() != expected
+    restore_random_state(load_tree(tmp_path / "random"))
+    assert draw() == expected
+
+
+def test_a_resumed_environment_starts_a_new_episode(tmp_path):
+    model = make()
+    path = run_and_kill(model, tmp_path)
+    first = model.replay_buffer.observations[0, 0].copy()
+    starts = []
+    for seed in (0, 0, 1):
+        resumed = make(seed=seed)
+        restore_training(resumed, path)
+        resumed.learn(20, reset_num_timesteps=False)
+        buffer = resumed.replay_buffer
+        assert buffer.steps[50, 0] == 0 and buffer.steps[51, 0] == 1
+        starts.append(buffer.observations[50, 0])
+    assert np.array_equal(starts[0], starts[1])
+    assert not np.array_equal(starts[0], starts[2]) and not np.array_equal(starts[0], first)
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_a_resumed_environment_meets_no_episode_of_another_use(tmp_path, n_envs):
+    """Evaluation takes the seeds from 10000 on and tuning those from 20000 on: small numbers, as a user's own are."""
+    model = make(make_vec_env(delayed, n_envs=n_envs), seed=1)
+    path = run_and_kill(model, tmp_path)
+    seeds = []
+    for seed, steps in ((1, 50), (1, 50), (1, 9999), (51, 50), (50, 51)):
+        state = load_tree(path)
+        state["counters"]["num_timesteps"] = steps
+        save_tree(path, state)
+        resumed = make(make_vec_env(delayed, n_envs=n_envs), seed=seed)
+        restore_training(resumed, path)
+        seeds.append(tuple(resumed.env._seeds))
+    assert seeds[0] == seeds[1] and len(set(seeds)) == 4
+    assert all(2**30 <= seed < 2**32 for each in seeds for seed in each)
+
+
+def test_a_resume_starts_a_new_episode_in_a_model_that_was_amid_one(tmp_path):
+    path = run_and_kill(make(), tmp_path)
+    fresh, used = make(), make().learn(50)
+    for model in (fresh, used):
+        restore_training(model, path)
+        model.learn(20, reset_num_timesteps=False)
+    assert_same(everything(fresh), everything(used))
+
+
+def test_a_resume_after_a_callback_has_ended_training_joins_no_two_episodes(tmp_path):
+    class Stop(BaseCallback):
+        def _on_step(self):
+            return self.num_timesteps < 40
+
+    make().learn(100, [TrainingCheckpointCallback(tmp_path, 1000), Stop()])
+    model = make()
+    restore_training(model, tmp_path / CHECKPOINT_NAME)
+    buffer = model.replay_buffer
+    assert (model.num_timesteps, buffer.size()) == (40, 39)  # SB3 does not store the last
+    model.learn(20, reset_num_timesteps=False)
+    assert buffer.steps[:59, 0].tolist() == [*range(15), *range(15), *range(9), *range(15), *range(5)]
+
+
+# ---------------------------------------------------------------------------------------------------- writing
+
+
+@pytest.mark.parametrize(("n_envs", "save_freq", "expected"), [(1, 30, [30, 60, 90, 100]), (3, 30, [30, 60, 90, 102])])
+def test_when_checkpoints_are_written(tmp_path, monkeypatch, n_envs, save_freq, expected):
+    written = []
+    monkeypatch.setattr(checkpoint, "save_tree", lambda path, state: written.append((path, state["counters"])))
+    model = make(make_vec_env(delayed, n_envs=n_envs)).learn(100, TrainingCheckpointCallback(tmp_path, save_freq))
+    assert [counters["num_timesteps"] for _, counters in written] == expected
+    assert {path for path, _ in written} == {tmp_path / CHECKPOINT_NAME}
+    model.learn(0, TrainingCheckpointCallback(tmp_path, save_freq), reset_num_timesteps=False)
+    assert len(written) == len(expected)  # nothing new
+
+
+def test_a_checkpoint_has_every_step_and_its_updates(tmp_path):
+    make().learn(60, TrainingCheckpointCallback(tmp_path, 25))
+    state = load_tree(tmp_path / CHECKPOINT_NAME)
+    assert len(state["replay_buffer"]["rewards"]) == state["counters"]["num_timesteps"] == 60
+    assert state["counters"]["_n_updates"] == 40
+
+
+def test_being_killed_while_writing_leaves_the_last_checkpoint(tmp_path, monkeypatch):
+    path = run_and_kill(make(), tmp_path)
+    before = path.read_bytes()
+
+    def killed(*_):
+        raise Killed
+
+    monkeypatch.setattr("sb3_said.files.archive._write_tensors", killed)
+    run_and_kill(make(), tmp_path, at=99, save_freq=20)
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+
+
+def test_evaluations_are_found_behind_a_progress_bar(tmp_path):
+    pytest.importorskip("rich")
+    callbacks = [evaluation(tmp_path), TrainingCheckpointCallback(tmp_path, 30)]
+    make().learn(50, callbacks, progress_bar=True)  # puts the list into another
+    again = [evaluation(tmp_path), TrainingCheckpointCallback(tmp_path, 30)]
+    restore_training(make(), tmp_path / CHECKPOINT_NAME, CallbackList([CallbackList(again)]))
+    assert again[0].evaluations_timesteps == [20, 40]
+
+
+# ---------------------------------------------------------------------------------------------------- misfits
+
+
+def test_a_checkpoint_without_newer_entries_still_loads(tmp_path):
+    path = run_and_kill(make(cls=SAID), tmp_path)
+    state = load_tree(path)
+    assert state["counters"].pop("_planner_trained_at") == 40
+    save_tree(path, state)
+    model = make(cls=SAID)
+    restore_training(model, path)
+    assert model.num_timesteps == 50 and model.policy.planner_is_trained
+    assert model.learn(10, reset_num_timesteps=False).num_timesteps == 60
+
+
+def test_the_planner_may_change_until_it_is_trained(tmp_path):
+    path = run_and_kill(make(cls=SAID, planner_train_freq=None), tmp_path)
+    model = make(cls=SAID, planner_train_freq=None, planner_kwargs={**PLANNER, "depth": 2})
+    restore_training(model, path)
+    assert model.learn(20, reset_num_timesteps=False).policy.planner_updates == 4
+    other = run_and_kill(make(cls=SAID, planner_train_freq=40), tmp_path / "other")
+    with pytest.raises(ValueError, match="other networks"):
+        restore_training(make(cls=SAID, planner_kwargs={**PLANNER, "depth": 2}), other)
+
+
+@pytest.mark.parametrize(
+    ("run", "resumed", "message"),
+    [
+        (make, lambda: make(buffer_size=40), "does not fit a buffer"),
+        (make, lambda: make(policy_kwargs={"net_arch": [8]}), "other networks"),
+        (make, lambda: make(ent_coef=0.1), "other networks or optimizers"),
+        (make, lambda: make(normalized(1)), "not normalised by VecNormalize, and this model's environment is;"),
+        (lambda: make(normalized(1)), make, "was normalised by VecNormalize, and this model's environment is not;"),
+        (make, lambda: make(cls=SAID), "other networks"),
+    ],
+)
+def test_another_runs_checkpoint_is_refused(run, resumed, message, tmp_path):
+    path = run_and_kill(run(), tmp_path)
+    with pytest.raises(ValueError, match=message):
+        restore_training(resumed(), path)
+
+
+def test_evaluations_must_be_those_of_the_run(tmp_path):
+    path = run_and_kill(make(), tmp_path, callbacks=[evaluation(tmp_path)])
+    with pytest.raises(ValueError, match=r"had 1 EvalCallback and is resumed with 0"):
+        restore_training(make(), path)
+
+
+def test_other_replay_buffers_are_refused():
+    with pytest.raises(ValueError, match="DelayedReplayBuffer"):
+        training_state(SAC("MlpPolicy", "Pendulum-v1", buffer_size=100, device="cpu"))

@@ -1,0 +1,265 @@
+"""The planner's windows: pieces of single episodes, values and splits, against plain lists of episodes."""
+
+import warnings
+
+import numpy as np
+import pytest
+import torch as th
+from counting_task import Player
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_said.replay.buffer import DelayedReplayBuffer
+from sb3_said.replay.windows import WindowSource
+
+
+def make_buffer(player, steps_per_env, rows):
+    vec = player.vec
+    size = steps_per_env * vec.num_envs
+    buffer = DelayedReplayBuffer(size, vec.observation_space, vec.action_space, "cpu", n_envs=vec.num_envs)
+    for row in rows:
+        buffer.add(*row.added())
+    return buffer
+
+
+def naive_episodes(rows, env):
+    """Cut one environment's rows into episodes: lists of rows, each with whether it terminated."""
+    episodes, steps = [], []
+    for row in rows:
+        steps.append(row)
+        if row.done[env] or row.interrupted or row is rows[-1]:
+            episodes.append((steps, bool(row.terminated[env])))
+            steps = []
+    return episodes
+
+
+def naive_starts(rows, n_envs, length, gamma=0.99, terminal_penalty=-100.0, value_fn=None):
+    """Map the tag of every stored state to (states, actions, n_valid, value), by walking through episodes."""
+    starts = {}
+    for env in range(n_envs):
+        for steps, terminated in naive_episodes(rows, env):
+            states = np.stack([row.states[env] for row in steps])
+            # SB3's scaled action, executed and scaled back
+            actions = np.stack([row.next_obs["action_history"][env, -1] for row in steps])
+            rewards = [float(row.reward[env]) for row in steps]
+            if terminated:
+                rewards[-1] = value = rewards[-1] if terminal_penalty is None else terminal_penalty
+            elif value_fn is not None:
+                value = float(value_fn(states[-1:], actions[-1:])[0])
+            else:
+                value = np.mean(rewards) / (1 - gamma)
+            for t in reversed(range(len(steps))):
+                value = value if t == len(steps) - 1 else rewards[t] + gamma * value
+                index = np.minimum(np.arange(t, t + length), len(steps) - 1)
+                n_valid = min(length, len(steps) - t)
+                starts[int(states[t, 0])] = states[index], actions[index], n_valid, value
+    return starts
+
+
+def assert_windows(source, starts, length):
+    """Compare every window there is with the naive ones; values after scaling both to [0, 1]."""
+    windows = source.gather(th.arange(len(source)), length)
+    tags = windows.states[:, 0, 0].int().tolist()
+    assert sorted(tags) == sorted(starts)  # each stored step starts one window: no episode is too short
+    states, actions, n_valid, values = (np.stack(x) for x in zip(*[starts[tag] for tag in tags], strict=True))
+    np.testing.assert_array_equal(windows.states, states)
+    np.testing.assert_array_equal(windows.actions, actions)
+    np.testing.assert_array_equal(windows.valid, np.arange(length) < n_valid[:, None])
+    spread = values.max() - values.min()
+    scaled = (values - values.min()) / spread if spread > 0 else np.ones_like(values)
+    # Large values close together lose digits
+    rounding = np.finfo(np.float32).eps * np.abs(values).max() / spread if spread > 0 else 0.0
+    np.testing.assert_allclose(windows.values, scaled, atol=1e-5 + 4 * rounding)
+    assert [x.dtype for x in windows] == [th.float32, th.float32, th.bool, th.float32]
+
+
+def critic(states, actions):
+    return 50 * states[:, 1] + 10 * actions[:, 0]
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    n_envs=st.integers(1, 3),
+    delay=st.sampled_from([1, (0, 3)]),
+    max_length=st.sampled_from([1, 4, 12, 60]),
+    interruption=st.sampled_from([0.0, 0.2]),
+    n_steps=st.integers(1, 80),
+    steps_per_env=st.integers(5, 40),
+    length=st.integers(1, 15),
+    newest_fraction=st.sampled_from([1.0, 0.5, 0.2, 0.001]),
+    value_fn=st.sampled_from([None, critic]),
+    seed=st.integers(0, 2**16),
+)
+def test_every_window_is_a_piece_of_one_episode(
+    n_envs, delay, max_length, interruption, n_steps, steps_per_env, length, newest_fraction, value_fn, seed
+):
+    player = Player(n_envs, delay, 3, max_length=max_length, interruption=interruption, seed=seed)
+    rows = player.play(n_steps)
+    source = make_buffer(player, steps_per_env, rows).window_source(newest_fraction, value_fn=value_fn)
+    n_rows = max(int(min(n_steps, steps_per_env) * newest_fraction), 1)
+    assert_windows(source, naive_starts(rows[-n_rows:], n_envs, length, value_fn=value_fn), length)
+    # Episodes are numbered apart, also where two end at the same time
+    assert len(source.episodes.unique()) == sum(len(naive_episodes(rows[-n_rows:], env)) for env in range(n_envs))
+
+
+@pytest.mark.parametrize(("gamma", "terminal_penalty"), [(0.5, -100.0), (0.99, 0.0), (0.9, 30.0), (0.9, None)])
+def test_discount_and_terminal_penalty(gamma, terminal_penalty):
+    player = Player(max_length=15)
+    rows = player.play(60)
+    source = make_buffer(player, 60, rows).window_source(gamma=gamma, terminal_penalty=terminal_penalty)
+    assert_windows(source, naive_starts(rows, 2, 5, gamma, terminal_penalty), 5)
+
+
+def test_no_discount_needs_a_value_function():
+    player = Player(max_length=15)
+    rows = player.play(40)
+    buffer = make_buffer(player, 60, rows)
+    with pytest.raises(ValueError, match="gamma"):
+        buffer.window_source(gamma=1.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        source = buffer.window_source(gamma=1.0, value_fn=critic)
+    assert_windows(source, naive_starts(rows, 2, 5, 1.0, value_fn=critic), 5)
+
+
+@pytest.mark.parametrize("fraction", [0.0, -0.2, 1.1, float("nan")])
+def test_bad_fractions_are_refused(fraction):
+    player = Player()
+    with pytest.raises(ValueError, match="newest_fraction"):
+        make_buffer(player, 20, player.play(3)).window_source(fraction)
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_without_a_warning_and_over_the_buffers_own_memory(n_envs):
+    player = Player(n_envs)
+    buffer = make_buffer(player, 20, player.play(30))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # one environment's indices used to be a read-only view
+        source = buffer.window_source()
+    assert source.states.data_ptr() == buffer.observations.ctypes.data
+    assert source.actions.data_ptr() == buffer.actions.ctypes.data
+    for name in ("rows", "envs", "remaining", "values", "episodes"):
+        assert getattr(source, name).numpy().flags.writeable
+
+
+@pytest.mark.parametrize("delay", [2, None])
+def test_states_are_normalised_as_the_experts_observations(delay):
+    player = Player(delay=delay)
+    rows = player.play(30)
+    buffer = make_buffer(player, 20, rows)
+    env = VecNormalize(player.vec, norm_obs_keys=None if delay is None else ["observation"])
+    rms = env.obs_rms if delay is None else env.obs_rms["observation"]
+    rms.update(np.concatenate([row.states for row in rows]))
+    plain, normalised = buffer.window_source(), buffer.window_source(env=env)
+    expected = (plain.states - th.tensor(rms.mean)) / th.tensor(rms.var + env.epsilon).sqrt()
+    th.testing.assert_close(normalised.states, expected.float().clamp(-10, 10))
+    for name in ("actions", "rows", "envs", "remaining", "values", "episodes"):
+        assert th.equal(getattr(normalised, name), getattr(plain, name))
+    assert normalised.states.dtype == th.float32
+
+
+# ---------------------------------------------------------------------------------------------------- a plain dataset
+
+
+def make_source(lengths):
+    """Return episodes of the given lengths in one environment; the state is (episode, step)."""
+    episodes = th.repeat_interleave(th.arange(len(lengths)), th.tensor(lengths))
+    steps = th.cat([th.arange(n) for n in lengths])
+    states = th.stack([episodes, steps], dim=1).float()[:, None]
+    remaining = th.tensor(lengths)[episodes] - steps
+    n = len(episodes)
+    return WindowSource(
+        states, -states[..., :1], th.arange(n), th.zeros(n, dtype=th.int64), remaining, steps / max(lengths), episodes
+    )
+
+
+def test_sample_is_uniform_over_steps_and_repeats_with_a_generator():
+    source = make_source([1, 3, 6])
+    windows = source.sample(20_000, 4, th.Generator().manual_seed(0))
+    starts, counts = th.unique(windows.states[:, 0], dim=0, return_counts=True)
+    assert len(starts) == 10
+    np.testing.assert_allclose(counts, 2000, atol=220)  # five standard deviations
+    again = source.sample(20_000, 4, th.Generator().manual_seed(0))
+    assert all(th.equal(a, b) for a, b in zip(windows, again, strict=True))
+    assert not th.equal(windows.states, source.sample(20_000, 4, th.Generator().manual_seed(1)).states)
+
+
+def test_a_short_episode_repeats_its_last_row():
+    windows = make_source([2, 9]).gather(th.tensor([0, 1, 2]), 4)
+    assert windows.states[..., 0].tolist() == [[0, 0, 0, 0], [0, 0, 0, 0], [1, 1, 1, 1]]
+    assert windows.states[..., 1].tolist() == [[0, 1, 1, 1], [1, 1, 1, 1], [0, 1, 2, 3]]
+    assert windows.actions[..., 0].tolist() == [[0, 0, 0, 0], [0, 0, 0, 0], [-1, -1, -1, -1]]
+    assert windows.valid.tolist() == [[True, True, False, False], [True, False, False, False], [True] * 4]
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    st.lists(st.integers(1, 30), min_size=2, max_size=20), st.sampled_from([0.01, 0.1, 0.5, 0.99]), st.integers(0, 1000)
+)
+def test_split_by_whole_episodes(lengths, held_out, seed):
+    source = make_source(lengths)
+    training, validation = source.split(held_out, seed)
+    parts = [set(part.episodes.tolist()) for part in (training, validation)]
+    assert parts[0] | parts[1] == set(range(len(lengths))) and not parts[0] & parts[1]
+    assert parts[0] and parts[1]
+    for part, numbers in zip((training, validation), parts, strict=True):
+        assert len(part) == sum(lengths[i] for i in numbers)
+        assert part.start_states()[:, 0].tolist() == part.episodes.tolist()  # every column is cut alike
+        th.testing.assert_close(part.start_states()[:, 1], part.values * max(lengths))
+        assert th.equal(part.remaining, th.tensor(lengths)[part.episodes] - part.start_states()[:, 1].long())
+        assert part.states is source.states  # not copied
+    # As many as asked for, and no episode more than needed; one is always left for training
+    enough = len(validation) >= held_out * len(source)
+    assert enough or len(parts[0]) == 1
+    smallest_surplus = len(validation) - max(lengths[i] for i in parts[1])
+    assert smallest_surplus < held_out * len(source)
+
+
+def test_split_repeats_with_its_seed():
+    source = make_source([3] * 30)
+    assert th.equal(source.split(0.2, 1)[1].rows, source.split(0.2, 1)[1].rows)
+    assert not th.equal(source.split(0.2, 1)[1].rows, source.split(0.2, 2)[1].rows)
+
+
+def test_split_needs_two_episodes():
+    with pytest.raises(ValueError, match="at least two episodes"):
+        make_source([10]).split(0.1)
+
+
+def test_dimensions_and_starts():
+    source = make_source([2, 3])
+    assert (len(source), source.obs_dim, source.act_dim) == (5, 2, 1)
+    assert th.equal(source.start_actions(), -source.start_states()[:, :1])
+    half = source.split(0.5)[1]
+    assert half.start_actions().shape == (len(half), 1)
+
+
+def test_sample_windows_of_the_buffer():
+    player = Player(max_length=6)
+    rows = player.play(50)
+    windows = make_buffer(player, 20, rows).sample_windows(64, 5, th.Generator().manual_seed(0))
+    starts = naive_starts(rows[-20:], 2, 5)
+    for states, actions, valid in zip(windows.states, windows.actions, windows.valid, strict=True):
+        expected_states, expected_actions, n_valid, _ = starts[int(states[0, 0])]
+        np.testing.assert_array_equal(states, expected_states)
+        np.testing.assert_array_equal(actions, expected_actions)
+        assert valid.sum() == n_valid
+
+
+def test_moving_to_where_it_is_copies_nothing():
+    source = make_source([2, 3])
+    moved = source.to("cpu")
+    for name in ("states", "actions", "rows", "envs", "remaining", "values", "episodes"):
+        assert getattr(moved, name) is getattr(source, name)
+
+
+@pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
+def test_windows_of_a_gpu_are_those_of_the_cpu():
+    source = make_source([2, 9, 4])
+    on_gpu = source.to("cuda")
+    starts = th.arange(len(source))
+    for a, b in zip(source.gather(starts, 4), on_gpu.gather(starts.cuda(), 4), strict=True):
+        assert b.is_cuda and th.equal(a, b.cpu())
+    drawn = on_gpu.sample(64, 4, th.Generator("cuda").manual_seed(0))
+    assert drawn.states.is_cuda and len(drawn.states[:, 0].unique(dim=0)) > 10

@@ -1,0 +1,59 @@
+"""What tests of saved files share."""
+
+import zipfile
+
+import numpy as np
+import torch as th
+from stable_baselines3 import SAC
+
+from sb3_said.files.agents import SafeSaveMixin
+
+
+class SafeSAC(SafeSaveMixin, SAC):
+    pass
+
+
+def make_sac(env="Pendulum-v1", policy="MlpPolicy", cls=SafeSAC, **kwargs):
+    arguments = {"learning_starts": 10, "batch_size": 8, "buffer_size": 200, "seed": 0, "device": "cpu"}
+    return cls(policy, env, **(arguments | {"policy_kwargs": {"net_arch": [8]}} | kwargs))
+
+
+def same(first, second):
+    """Equal in type, dtype, shape and every bit; NaN equals NaN."""
+    if isinstance(first, th.Tensor):
+        return (
+            isinstance(second, th.Tensor)
+            and first.dtype == second.dtype
+            and first.shape == second.shape
+            and raw(first) == raw(second)
+        )
+    if isinstance(first, (np.ndarray, np.generic)):
+        return (
+            type(first) is type(second)
+            and first.dtype == second.dtype
+            and first.shape == second.shape
+            and first.tobytes() == second.tobytes()
+        )
+    if isinstance(first, dict):
+        return isinstance(second, dict) and same(list(first.items()), list(second.items()))
+    if isinstance(first, (list, tuple)):
+        return type(first) is type(second) and len(first) == len(second) and all(map(same, first, second))
+    if isinstance(first, float):
+        return type(second) is float and repr(first) == repr(second)
+    return type(first) is type(second) and first == second
+
+
+def raw(tensor):
+    tensor = tensor.detach().resolve_conj().contiguous().reshape(-1)
+    return tensor.view(th.uint8).numpy().tobytes() if len(tensor) else b""
+
+
+def edit(path, change):
+    """Rewrite the members, as an attacker would."""
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    members = change(members)
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    return path

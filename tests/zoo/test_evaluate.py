@@ -1,0 +1,195 @@
+"""evaluate.py and enjoy.py: what they write for a SAID run, and what they say when they are asked for nonsense."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+pytest.importorskip("rl_zoo3")
+
+from small_run import ENV, TINY_PLANNER, write_run
+
+from sb3_said import SAID, DelayedObservationWrapper
+from sb3_said.evaluation import rollout
+from sb3_said.zoo import enjoy, evaluate
+from sb3_said.zoo.runs import load_run
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_run(tmp_path_factory.mktemp("said") / f"{ENV}-delay2_1", SAID, 2, steps=100)
+
+
+def test_evaluate_measures_the_planner_and_the_expert(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("matplotlib")
+    plot = run / "plot.png"
+    evaluate.main([str(run), "--episodes", "3", "--n-envs", "2", "--latency-calls", "5", "--seed", "7",
+                   "--plot", str(plot), "--device", "cpu"])  # fmt: skip
+    document = json.loads((run / "evaluation.json").read_text())
+    assert (document["algo"], document["env"], document["delay"]) == ("said", ENV, 2)
+    assert (document["seed"], document["n_episodes"], document["trained_steps"]) == (7, 3, 100)
+    assert [result["label"] for result in document["results"]] == ["planner", "expert"]
+    # The file holds what the library measures for the same agent and seeds.
+    model = SAID.load(run / f"{ENV}.zip", device="cpu")
+    for result in document["results"]:
+        with model.policy.answering(result["label"]):
+            played = rollout(model, lambda: DelayedObservationWrapper(gym.make(ENV), delay=2), 3, seed=7)
+        assert result["returns"] == played.returns.tolist() and result["lengths"] == played.lengths.tolist()
+        assert result["latency"]["n_calls"] == 5
+    out = capsys.readouterr().out
+    assert all(word in out for word in ("planner", "expert", "p95", "evaluation.json"))
+    assert plot.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_shorter_delay_keeps_the_length_of_the_action_history(run: Path) -> None:
+    loaded = load_run(run, delay=1, device="cpu")
+    env = loaded.make_env()
+    observation, _ = env.reset(seed=0)
+    for _ in range(3):
+        observation, *_ = env.step(env.action_space.sample())
+    assert loaded.info["delay"] == 1 and observation["delay"] == 1 and observation["action_history"].shape == (2, 1)
+
+
+def test_an_agent_without_its_run_folder(run: Path, tmp_path: Path) -> None:
+    alone = tmp_path / "agent.zip"
+    alone.write_bytes((run / f"{ENV}.zip").read_bytes())
+    loaded, full = load_run(alone, algo="said", env_id=ENV, device="cpu"), load_run(run, device="cpu")
+    assert loaded.info["delay"] == full.info["delay"] == 2
+    left, right = (rollout(r.model, r.make_env, 2, seed=0) for r in (loaded, full))
+    np.testing.assert_array_equal(left.returns, right.returns)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--delay", "5"], "built for delays 0..2"),
+        (["--env", "Hopper-v5"], "observation_space shapes"),
+        (["--episodes", "0"], "at least 1"),
+        (["--algo", "nonsense"], "give --algo"),
+    ],
+)
+def test_evaluate_says_what_is_wrong(
+    run: Path, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as exit_info:
+        evaluate.main([str(run), *arguments])
+    assert exit_info.value.code == 2 and message in capsys.readouterr().err
+
+
+def test_paths_that_hold_no_agent(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="does not exist"):
+        load_run(tmp_path / "nowhere")
+    with pytest.raises(ValueError, match=f"holds the runs .*{run.name}"):
+        load_run(run.parent)
+    (tmp_path / ENV).mkdir()
+    (tmp_path / ENV / "args.yml").write_text("{}")
+    with pytest.raises(ValueError, match="no finished agent"):
+        load_run(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--record", "film.avi"], "ending in .mp4 or .gif"),
+        (["--record", "film.gif", "--fps", "0"], "at least 1"),
+        ([], "no display"),
+    ],
+)
+def test_enjoy_says_what_is_wrong(
+    run: Path,
+    arguments: list[str],
+    message: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(SystemExit) as exit_info:
+        enjoy.main([str(run), *arguments])
+    assert exit_info.value.code == 2 and message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("fps", "expected"), [(10, 40), (25, 100), (60, 100)])
+def test_video_plays_in_real_time(fps: int, expected: int, tmp_path: Path) -> None:
+    imageio = pytest.importorskip("imageio.v3")
+
+    class Drawn:
+        metadata = {"render_fps": 25}
+
+        def render(self) -> np.ndarray:
+            return np.random.default_rng(video._steps).integers(0, 255, (32, 32, 3), np.uint8)
+
+    video = enjoy.Video(tmp_path / "sub" / "film.gif", fps)
+    for _ in range(100):  # 4 seconds
+        video.on_step(Drawn())
+    video.close()
+    assert video.frames == expected and video.fps == min(fps, 25)
+    assert len(imageio.imread(video.path)) == expected
+    assert imageio.immeta(video.path)["duration"] == pytest.approx(1000 / video.fps, abs=10)  # GIFs count in 10 ms
+
+
+def test_a_task_that_cannot_be_drawn_names_the_libraries(tmp_path: Path) -> None:
+    class Broken:
+        metadata: dict = {}
+
+        def render(self) -> None:
+            raise OSError("libEGL.so.1: cannot open shared object file")
+
+    with pytest.raises(enjoy.CannotDraw, match=r"(?s)libEGL.*apt-get install libegl1"):
+        enjoy.Video(tmp_path / "film.mp4", 25).on_step(Broken())
+
+
+def test_enjoy_prints_every_episode(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+                                    monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
+    pytest.importorskip("imageio")
+    # Drawing needs a GL library that a test machine may lack: a blank picture stands in for it.
+    monkeypatch.setattr("gymnasium.envs.mujoco.MujocoEnv.render", lambda self: np.zeros((32, 32, 3), np.uint8))
+    monkeypatch.setattr(enjoy, "check_can_record", lambda: None)
+    film = tmp_path / "film.gif"
+    enjoy.main([str(run), "--record", str(film), "--episodes", "2", "--answer", "expert", "--device", "cpu"])
+    out = capsys.readouterr().out
+    assert "seed 10000: return" in out and "seed 10001: return" in out and film.stat().st_size > 0
+
+
+def test_enjoy_draws_an_mp4(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                            capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
+    imageio = pytest.importorskip("imageio")
+    pytest.importorskip("imageio_ffmpeg")
+    monkeypatch.setenv("MUJOCO_GL", os.environ.get("MUJOCO_GL", "egl"))
+    env = gym.make(ENV, render_mode="rgb_array")
+    env.reset()
+    try:
+        env.render()
+    except Exception as error:  # each graphics library fails in its own way
+        pytest.skip(f"nothing can be drawn here: {error!r}")
+    finally:
+        env.close()
+    film = tmp_path / "film.mp4"
+    enjoy.main([str(run), "--record", str(film), "--answer", "expert", "--device", "cpu"])
+    with imageio.get_reader(film) as reader:
+        frames = [frame for frame in reader.iter_data()]  # list() would ask for a length, which is infinite
+    assert f"{len(frames)} frames" in capsys.readouterr().out
+    assert all(frame.shape == (480, 480, 3) and frame.std() > 10 for frame in frames)  # a picture, not a blank
+
+
+@pytest.mark.parametrize(("env_id", "camera"), [("Hopper-v5", 0), ("InvertedPendulum-v5", -1)])
+def test_videos_follow_a_robot_that_has_a_camera_for_it(env_id, camera):
+    env = gym.make(env_id, render_mode="rgb_array")
+    enjoy.follow(env)
+    assert env.unwrapped.mujoco_renderer.camera_id == camera
+    env.close()
+
+
+def test_an_agent_that_reads_a_state_history_plays_without_its_run_folder(tmp_path: Path) -> None:
+    env = DelayedObservationWrapper(gym.make(ENV), delay=2, state_history=True)
+    planner = {**TINY_PLANNER, "extra_state_probability": 0.5}
+    SAID("MultiInputPolicy", env, device="cpu", planner_kwargs=planner).save(tmp_path / "agent.zip")
+    run = load_run(str(tmp_path / "agent.zip"), "said", ENV, delay=1)
+    assert set(run.make_env().observation_space.spaces) >= {"state_history", "state_known"}
+    assert rollout(run.model, run.make_env, 1, seed=0).lengths[0] > 0

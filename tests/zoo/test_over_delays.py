@@ -1,0 +1,273 @@
+"""over_delays.py: what it plays, what it keeps, and what it does not play again."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections import OrderedDict
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import yaml
+
+pytest.importorskip("rl_zoo3")
+
+from small_run import ENV, write_run
+
+from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
+from sb3_said.evaluation import Summary
+from sb3_said.zoo import evaluate, over_delays
+from sb3_said.zoo.runs import load_run
+
+
+@pytest.fixture(scope="module")
+def said(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_run(tmp_path_factory.mktemp("said") / f"{ENV}-delay2_1", SAID, 2)
+
+
+@pytest.fixture(scope="module")
+def sadr(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_run(tmp_path_factory.mktemp("sadr") / f"{ENV}-delay1_1", DelayedSAC, 1)
+
+
+def play(file: Path, runs: list[str | Path], delays: list[str], *more: str) -> dict[str, Any]:
+    """Call the script, and return what it wrote."""
+    words = [*map(str, runs), "--delays", *delays, "--json", str(file), "--episodes", "3", "--device", "cpu", *more]
+    over_delays.main(words)
+    return json.loads(file.read_text())
+
+
+def by_cell(document: dict[str, Any]) -> dict[tuple[str, Any], Any]:
+    return {(cell["agent"], cell["delay"]): cell["result"] for cell in document["cells"]}
+
+
+def count_plays(monkeypatch: pytest.MonkeyPatch, stop_after: int | None = None) -> list[tuple[str, Any]]:
+    """Return a list that will hold the agent and delay of every cell played from now on."""
+    played: list[tuple[str, Any]] = []
+    original = over_delays.play
+
+    def counted(cell: over_delays.Cell, *how: Any) -> Summary:
+        if len(played) == stop_after:
+            raise KeyboardInterrupt
+        played.append((cell.agent, cell.delay))
+        return original(cell, *how)
+
+    monkeypatch.setattr(over_delays, "play", counted)
+    return played
+
+
+def test_cells_are_what_evaluate_measures(
+    said: Path, sadr: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("matplotlib")
+    delays, plot = ["0", "2", "UniformDelay(0, 1)"], tmp_path / "sub" / "plot.png"
+    document = play(tmp_path / "sub" / "out.json", [f"any={said}", sadr], delays, "--plot", str(plot))
+    out = capsys.readouterr().out
+    cells, short = by_cell(document), f"{sadr.parent.name}/{sadr.name}"
+    assert [*cells] == [
+        (agent, delay) for agent in ("any planner", "any expert", short) for delay in (0, 2, "UniformDelay(0, 1)")
+    ]
+    for folder, delay, agents in (
+        (said, "0", ["any planner", "any expert"]),
+        (said, "UniformDelay(0, 1)", ["any planner", "any expert"]),
+        (sadr, "UniformDelay(0, 1)", [short]),
+    ):
+        target = tmp_path / "evaluation.json"
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # another delay than the trained one
+            evaluate.main([str(folder), "--delay", delay, "--json", str(target), "--episodes", "3",
+                           "--latency-calls", "0", "--device", "cpu"])  # fmt: skip
+        for agent, result in zip(agents, json.loads(target.read_text())["results"], strict=True):
+            cell = cells[agent, int(delay) if delay.isdigit() else delay]
+            del result["label"]
+            assert result == cell
+    assert cells[short, 2] is None
+    assert f"{short} cannot play delay 2: it was built for delays 0..1." in out
+    table = {
+        row.split("|")[1].strip(): [x.strip() for x in row.split("|")[2:-1]] for row in out.splitlines() if "|" in row
+    }
+    assert table["return under delay"] == [*delays, "mean of fixed", "mean of random"]
+    assert table[short][1] == "-" and table[short][3].endswith(", 1 of 2")
+    mean = np.mean([cells["any planner", 0]["returns"], cells["any planner", 2]["returns"]])
+    assert table["any planner"][3].startswith(f"{mean:.1f} [")
+    assert plot.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_runs_of_one_label_play_each_its_own_delay(
+    said: Path, sadr: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    random = write_run(tmp_path / "random", DelayedSAC, (0, 1))
+    runs = [f"each={said}", f"each={sadr}", f"each={random}", f"one={sadr}"]
+    document = play(tmp_path / "out.json", runs, ["0", "1", "2", "EpisodeDelay(0,1)"])
+    files = {(cell["agent"], cell["delay"]): Path(cell["file"]).parent for cell in document["cells"] if cell["result"]}
+    assert files == {
+        ("each planner", 2): said, ("each expert", 2): said, ("each", 1): sadr, ("each", "EpisodeDelay(0,1)"): random,
+        ("one", 0): sadr, ("one", 1): sadr, ("one", "EpisodeDelay(0,1)"): sadr,
+    }  # fmt: skip
+    cells = by_cell(document)
+    assert cells["each", 1] == cells["one", 1]  # the same file, played once or twice
+    row = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("| each  "))
+    assert [word.strip() == "-" for word in row.split("|")[2:5]] == [True, False, True]  # delays 0, 1, 2
+
+
+@pytest.mark.parametrize("answer", ["planner", "expert"])
+def test_one_answer_alone_can_be_asked_for(said: Path, sadr: Path, tmp_path: Path, answer: str) -> None:
+    document = play(tmp_path / "out.json", [f"a={said}", f"b={sadr}"], ["1"], "--answer", answer)
+    assert [*by_cell(document)] == [(f"a {answer}", 1), ("b", 1)]  # another algorithm's agent has but one
+
+
+def test_what_was_played_is_not_played_again(said: Path, sadr: Path, tmp_path: Path, monkeypatch) -> None:
+    file = tmp_path / "out.json"
+    played = count_plays(monkeypatch, stop_after=4)
+    with pytest.raises(SystemExit) as exit_info:
+        play(file, [said, sadr], ["0", "1", "2"])
+    assert exit_info.value.code == 130
+    assert len(by_cell(json.loads(file.read_text()))) == 4 + 1  # and the one that cannot be played
+    monkeypatch.undo()
+    before, rest = by_cell(json.loads(file.read_text())), count_plays(monkeypatch)
+    document = play(file, [said, sadr], ["0", "1", "2"])
+    assert len(rest) == 4 and not set(rest) & set(played)
+    assert before.items() <= by_cell(document).items()
+    assert [cell["origin"] for cell in document["cells"]] == [0, 0, 0, 0, 1, 1, 1, 1, None]
+    assert len(document["origins"]) == 2
+
+    written = file.read_bytes()
+    play(file, [said, sadr], ["0", "1", "2"])
+    assert len(rest) == 4 and file.read_bytes() == written
+    # A delay and an agent are known however they are written, and a smaller call forgets nothing.
+    part = play(file, [f"other={sadr}"], ["FixedDelay(1)"])
+    assert len(rest) == 4 and len(part["cells"]) == 9
+    assert by_cell(part)["other", 1] == document["cells"][-2]["result"]
+    for written_so in ("UniformDelay(0, 1)", "UniformDelay(low=0,high=1)"):
+        play(file, [sadr], [written_so])
+        assert len(rest) == 5
+
+
+def test_without_runs_what_was_played_is_shown(
+    said: Path, sadr: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("matplotlib")
+    file, plot = tmp_path / "out.json", tmp_path / "plot.png"
+    runs = [f"any={said}", f"one={sadr}", f"again={sadr}"]
+    play(file, runs, ["0", "UniformDelay(0, 1)", "1", "2"])
+    full, written, played = capsys.readouterr().out, file.read_bytes(), count_plays(monkeypatch)
+
+    def show(*words: str) -> list[list[str]]:
+        over_delays.main(["--json", str(file), *words])
+        lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
+        return [[word.strip() for word in line.split("|")[1:-1]] for line in lines]
+
+    assert show() == [[word.strip() for word in line.split("|")[1:-1]] for line in full.splitlines() if "|" in line]
+    header, _, first, second = show("--rows", "one", "any expert", "--delays", "1", "UniformDelay(low=0, high=1)",
+                                    "--plot", str(plot))  # fmt: skip
+    assert header[1:3] == ["1", "UniformDelay(low=0, high=1)"]
+    cells = by_cell(json.loads(written))
+    for row, agent in ((first, "one"), (second, "any expert")):
+        assert row[0] == agent
+        for column, delay in ((1, 1), (2, "UniformDelay(0, 1)")):
+            assert row[column].startswith(f"{np.mean(cells[agent, delay]['returns']):.1f} [")
+    assert plot.read_bytes()[:4] == b"\x89PNG"
+    play(file, runs, ["0", "1"], "--rows", "again")
+    assert not played  # an agent under two labels is known under both
+    assert file.read_bytes() != written and by_cell(json.loads(file.read_text())) == cells
+    for words, message in (
+        (["--rows", "x"], "the rows are any planner"),
+        (["--delays", "16"], "holds nothing of the delays [16]"),
+        (["--json", str(plot) + "x"], "not exist"),
+    ):
+        with pytest.raises(SystemExit):
+            show(*words)
+        assert message in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        over_delays.main([str(said), "--json", str(file)])
+    assert "--delays is missing" in capsys.readouterr().err
+
+
+def test_a_changed_agent_is_played_again(said: Path, tmp_path: Path, monkeypatch) -> None:
+    file, folder = tmp_path / "out.json", tmp_path / "d1"
+    write_run(folder, DelayedSAC, 1)
+    old = play(file, [f"a={said}", f"b={folder}"], ["0", "1"])
+    write_run(folder, DelayedSAC, 1, seed=5)
+    played = count_plays(monkeypatch)
+    new = play(file, [f"b={folder}"], ["1"])
+    assert played == [("b", 1)]
+    # What the agent did before it changed is gone, also where it was not asked for now.
+    assert sorted(by_cell(new), key=str) == sorted(
+        [(f"a {w}", d) for w in ("expert", "planner") for d in (0, 1)] + [("b", 1)]
+    )
+    assert by_cell(new)["b", 1] != by_cell(old)["b", 1]
+    assert by_cell(new)["a expert", 0] == by_cell(old)["a expert", 0]
+
+
+def test_workers_change_the_speed_only(said: Path, tmp_path: Path) -> None:
+    delays = ["1", "WIFI_20MS", "RandomWalkDelay(0, 2, move_prob=0.5)"]  # the second needs 6 steps
+    one, two = (play(tmp_path / f"{n}.json", [said], delays, "--workers", n) for n in ("1", "2"))
+    assert one["cells"] == two["cells"]
+    assert [cell["result"] is None for cell in two["cells"]] == [False, True, False] * 2
+
+
+def test_only_the_warning_of_another_delay_is_silent(sadr: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.warns(UserWarning, match="learned at ages"):
+        load_run(sadr, delay=0, device="cpu")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        over_delays.open_run(str(sadr), None, None, 0, "cpu")
+    monkeypatch.setattr(over_delays, "load_run", lambda *_: warnings.warn("This file is old.", stacklevel=1))
+    with pytest.warns(UserWarning, match="old"):
+        over_delays.open_run(str(sadr), None, None, 0, "cpu")
+
+
+def test_a_planner_of_one_delay_plays_no_other(said: Path) -> None:
+    model: Any = load_run(said, device="cpu").model
+    planner = model.policy.planner
+    planner.config = replace(planner.config, mask="fixed")
+    found = {delay: over_delays.obstacle(model, "planner", delay) for delay in (1, 2, "UniformDelay(0, 2)")}
+    assert found == {delay: None if delay == 2 else "its planner was trained for delay 2 alone" for delay in found}
+    assert over_delays.obstacle(model, "expert", 1) is None
+
+
+def test_an_average_pairs_episodes_of_one_start() -> None:
+    row: dict[int | str, Summary] = {
+        0: Summary.from_episodes("", [0.0, 10.0], [1, 1]), 4: Summary.from_episodes("", [10.0, 0.0], [1, 1])
+    }  # fmt: skip
+    assert over_delays.average(row, [0, 4]) == "5.0 [5.0, 5.0]"  # each start has a mean of 5
+    assert over_delays.average(row, [0, 4, 8]) == "5.0 [5.0, 5.0], 2 of 3"
+    assert over_delays.average(row, [8]) == "-"
+
+
+@pytest.mark.parametrize(
+    ("runs", "more", "message"),
+    [
+        (["{said}", "{said}"], [], "have the label"),
+        (["{said}", "x={nowhere}"], [], "does not exist"),
+        (["{said}"], ["--delays", "-1"], "whole number of control steps >= 0"),
+        (["{said}"], ["--workers", "0"], "must be at least 1"),
+        (["{said}"], ["--seed", "1"], "give another --json"),
+    ],
+)
+def test_what_cannot_be_done_is_said(
+    said: Path, tmp_path: Path, runs: list[str], more: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "out.json"
+    settings = {"env": ENV, "n_episodes": 3, "seed": 10_000, "deterministic": True}
+    file.write_text(json.dumps({**settings, "origins": [], "cells": []}))
+    paths = {"said": said, "nowhere": tmp_path / "nowhere"}
+    with pytest.raises(SystemExit) as exit_info:
+        play(file, [run.format(**paths) for run in runs], ["0"], *more)
+    assert exit_info.value.code == 2 and message in capsys.readouterr().err
+
+
+def test_runs_of_two_tasks_are_refused(sadr: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    env = DelayedObservationWrapper(gym.make("Pendulum-v1"), delay=1)
+    other = tmp_path / "other"
+    DelayedSAC("MultiInputPolicy", env, buffer_size=10, device="cpu").save(other / "Pendulum-v1.zip")
+    (other / "Pendulum-v1").mkdir()
+    (other / "Pendulum-v1" / "args.yml").write_text(yaml.dump(OrderedDict(algo="sadr", env="Pendulum-v1")))
+    (other / "Pendulum-v1" / "config.yml").write_text((sadr / ENV / "config.yml").read_text())
+    with pytest.raises(SystemExit):
+        play(tmp_path / "out.json", [sadr, other], ["0"])
+    assert "several tasks cannot be compared" in capsys.readouterr().err

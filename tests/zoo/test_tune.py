@@ -1,0 +1,186 @@
+"""tune.py: trains each depth once, resumes, shares its work between workers, prunes, and reports on fresh episodes."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch as th
+
+pytest.importorskip("rl_zoo3")
+pytest.importorskip("scipy")
+
+from trained_run import config_of, read_by_train, train_run, train_said
+
+from sb3_said import SAID, PlannerConfig
+from sb3_said.evaluation import rollout
+from sb3_said.files.agents import load_tree
+from sb3_said.files.checkpoint import CHECKPOINT_NAME
+from sb3_said.zoo import tune
+from sb3_said.zoo.manager import read_delay
+from sb3_said.zoo.runs import load_run
+from sb3_said.zoo.winner import RunConfig
+
+SCRIPT = Path(tune.__file__)
+QUICK = ["--episodes", "4", "--round", "2", "--report-episodes", "3", "--device", "cpu", "--num-threads", "1"]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return train_said(tmp_path_factory.mktemp("logs"))
+
+
+@pytest.fixture
+def run(trained: Path, tmp_path: Path) -> Path:
+    """A run of its own, since tuning writes into it."""
+    return Path(shutil.copytree(trained, tmp_path / "run"))
+
+
+def forbidden(*_: Any, **__: Any) -> Any:
+    raise AssertionError("this was done already")
+
+
+def test_a_search_from_grid_to_report(
+    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("matplotlib")
+    command = ["--run", str(run), "--depths", "1", "2", "--temperatures", "0", "1", "--sampling-steps", "2", *QUICK]
+    seeds: list[int] = []
+
+    def recorded(model: Any, env: Any, n: int, seed: int, *args: Any, **kwargs: Any) -> Any:
+        seeds.extend(range(seed, seed + n))
+        return rollout(model, env, n, seed, *args, **kwargs)
+
+    monkeypatch.setattr(tune, "rollout", recorded)
+    tune.main(command)
+    # Once for two temperatures, and never the depth that the run itself has.
+    out = capsys.readouterr().out
+    assert out.count("Training the planner of depth") == out.count("Training the planner of depth 2:") == 1
+    results = json.loads((run / "tune" / "results.json").read_text())
+    cells = {(trial["depth"], trial["temperature"]) for trial in results["trials"]}
+    assert len(results["trials"]) == 4 and cells == {(1, 0.0), (1, 1.0), (2, 0.0), (2, 1.0)}
+    assert (run / "tune" / "importance.png").is_file() and (run / "tune" / "slice.png").is_file()
+
+    # The report is on other episodes, and evaluate.py gets the same numbers from best.zip.
+    report = results["report"]
+    assert set(seeds) == set(range(20_000, 20_004))
+    assert not set(seeds) & set(range(report["seed"], report["seed"] + report["n_episodes"]))
+    best = load_run(run / "tune" / "best.zip", device="cpu")
+    assert best.info["delay"] == 2 and isinstance(best.model, SAID)
+    winner = results["winner"]
+    config = best.model.policy.planner.config
+    assert (config.depth, config.temperature) == (winner["depth"], winner["temperature"])
+    assert config.sampling_steps == winner["sampling_steps"] == 2 != PlannerConfig().sampling_steps
+    for one in report["results"]:
+        with best.model.policy.answering(one["label"]):
+            played = rollout(best.model, best.make_env, 3, report["seed"], n_envs=8)
+        assert one["returns"] == played.returns.tolist()
+    assert [one["label"] for one in report["results"]] == ["planner", "expert"]
+
+    # The same command again makes nothing twice, and still says what was found.
+    monkeypatch.setattr(tune, "rollout", forbidden)
+    monkeypatch.setattr(tune, "evaluate", forbidden)
+    tune.main(command)
+    out = capsys.readouterr().out
+    assert "No trial is left" in out and "4 trials" in out and "Training" not in out
+    assert json.loads((run / "tune" / "results.json").read_text())["report"] == report
+
+    # A grid that grew makes only what is new.
+    monkeypatch.setattr(tune, "rollout", rollout)
+    tune.main(["--run", str(run), "--depths", "1", "--temperatures", "0", "0.5", "1", "--sampling-steps", "2", *QUICK])
+    trials = json.loads((run / "tune" / "results.json").read_text())["trials"]
+    assert [(t["depth"], t["temperature"]) for t in trials[4:]] == [(1, 0.5)]
+
+
+@pytest.mark.parametrize(
+    ("delay", "params"),
+    [
+        ([0, 3], []),
+        ([2], ["normalize:dict(norm_obs_keys=['observation'])"]),
+        ([1, 2], ["normalize:dict(norm_obs=False)"]),
+    ],
+    ids=["drawn delay", "VecNormalize", "normalized rewards"],
+)
+def test_a_search_with_a_drawn_delay_or_vec_normalize(delay: list[int], params: list[str], tmp_path: Path) -> None:
+    run = train_said(tmp_path, *params, delay=delay)
+    tune.main(["--run", str(run), "--depths", "1", "2", "--temperatures", "0.5", *QUICK])
+    results = json.loads((run / "tune" / "results.json").read_text())
+    assert [(trial["depth"], trial["temperature"]) for trial in results["trials"]] == [(1, 0.5), (2, 0.5)]
+
+    # A depth is trained on the very data, in the very units, that the run's own planner was.
+    own, other = (load_tree(run / "tune" / f"planner_depth{depth}.zip")["planner"] for depth in (1, 2))
+    statistics = [name for name in own if name.startswith("normalizer.")]
+    assert statistics
+    for name in statistics:
+        th.testing.assert_close(other[name], own[name], rtol=0, atol=0)
+
+    # What is reported is what best.zip and its statistics give again, and best.yml is of the same task.
+    best, report = load_run(run / "tune" / "best.zip", device="cpu"), results["report"]
+    assert (best.normalize is not None) == bool(params)
+    for one in report["results"]:
+        with best.model.policy.answering(one["label"]):
+            played = rollout(best.model, best.make_env, 3, report["seed"], n_envs=8, normalize=best.normalize)
+        assert one["returns"] == played.returns.tolist()
+    expected = {**config_of(run), "n_timesteps": 200}
+    tried = ("depth", "temperature", "sampling_steps")
+    expected["planner_kwargs"] |= {name: results["winner"][name] for name in tried}
+    assert read_by_train(run / "tune" / "best.yml", read_delay([str(d) for d in delay]), "cpu", tmp_path) == expected
+    command = RunConfig.read(run).train_command(run / "tune")
+    assert f"--delay {' '.join(map(str, delay))} -conf" in command
+
+
+@pytest.mark.parametrize("storage", [[], ["--storage", "sqlite:///{}/study.db"]], ids=["journal", "sqlite"])
+def test_two_workers_share_a_study_and_train_no_depth_twice(run: Path, storage: list[str]) -> None:
+    grid = ["--depths", "2", "3", "--temperatures", "0", "1"]
+    command = [sys.executable, str(SCRIPT), "--run", str(run), *grid, *QUICK, *(word.format(run) for word in storage)]
+    environ = {**os.environ, "OMP_NUM_THREADS": "1"}
+    workers = [
+        subprocess.Popen(command, env=environ, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        for _ in range(2)
+    ]
+    outputs = [worker.communicate(timeout=240)[0] for worker in workers]
+    assert [worker.returncode for worker in workers] == [0, 0], outputs
+    assert sum(out.count("Training the planner of depth 2") for out in outputs) == 1, outputs
+    assert sum(out.count("Training the planner of depth 3") for out in outputs) == 1, outputs
+    trials = json.loads((run / "tune" / "results.json").read_text())["trials"]
+    assert len(trials) == 4 and len({(t["depth"], t["temperature"]) for t in trials}) == 4
+    assert (run / "study.db" if storage else run / "tune" / "study.log").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--seed", "10049"], "Tuning would play the reset seeds 10049..10068"),
+        (["--episodes", "0"], "--episodes must be at least 1, got 0"),
+        (["--prune", "1.5"], "--prune is a p-value"),
+        (["--depths", "2", "2"], "--depths names a value twice: 2 2"),
+        (["--temperatures", "-1"], "temperature is -1"),
+        (["--sampling-steps", "0"], "sampling_steps is 0"),
+        (["--sampling-steps", "2", "2"], "--sampling-steps names a value twice: 2 2"),
+        (["--depths", "0"], "depth is 0"),
+    ],
+)
+def test_says_what_is_wrong(run: Path, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_info:
+        tune.main(["--run", str(run), *arguments])
+    assert exit_info.value.code == 2 and message in capsys.readouterr().err
+
+
+def test_folders_that_cannot_be_tuned(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for folder, message in (
+        (tmp_path / "nowhere", "does not exist"),
+        (train_run(tmp_path, "sadr"), "is a run of 'sadr', which has no planner"),
+    ):
+        with pytest.raises(SystemExit):
+            tune.main(["--run", str(folder), "--device", "cpu"])
+        assert message in capsys.readouterr().err
+    (run / CHECKPOINT_NAME).unlink()
+    with pytest.raises(SystemExit):
+        tune.main(["--run", str(run), "--device", "cpu"])
+    assert "has no checkpoint.zip" in capsys.readouterr().err

@@ -1,0 +1,42 @@
+"""Runs that train.py left, which here were hardly trained."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sb3_said.zoo import train
+from sb3_said.zoo.manager import Delay, DelayedExperimentManager, Run
+
+ENV = "InvertedPendulum-v5"
+PLANNER = "dict(depth=1, d_model=32, horizon=4, sampling_steps=1, n_candidates=2, batch_size=8)"
+
+
+def train_run(folder: Path, algo: str, *params: str, delay: Sequence[int] = (2,)) -> Path:
+    train.main(
+        ["--algo", algo, "--env", ENV, "--delay", *map(str, delay), "--preset", "cpu", "-f", str(folder), "--seed", "3",
+         "--num-threads", "1", "--eval-freq", "-1", "--device", "cpu", "--verbose", "0", "-n", "200",
+         "-params", "learning_starts:100", "buffer_size:400", *params]
+    )  # fmt: skip
+    return next((folder / algo).iterdir())
+
+
+def train_said(folder: Path, *params: str, delay: Sequence[int] = (2,)) -> Path:
+    planner = ("planner_gradient_steps:3", f"planner_kwargs:{PLANNER}")
+    return train_run(folder, "said", *planner, *params, delay=delay)
+
+
+def read_by_train(best: Path, delay: Delay, preset: str, folder: Path) -> dict[str, Any]:
+    """Return the hyper-parameters that train.py gets from a best.yml."""
+    run = Run([], delay, preset, 25_000)
+    manager = DelayedExperimentManager(run, Namespace(), "said", ENV, str(folder), config=str(best), verbose=0)
+    return manager.read_hyperparameters()[0]
+
+
+def config_of(run: Path) -> dict[str, Any]:
+    """Return the hyper-parameters that a run was trained with."""
+    return dict(yaml.load((run / ENV / "config.yml").read_text(), Loader=yaml.UnsafeLoader))
