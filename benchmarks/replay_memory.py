@@ -26,7 +26,8 @@ from measure import parser, percentiles, print_table, ratio, turn_by_turn, write
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 
 from sb3_said import DelayedObservationWrapper
-from sb3_said.replay.buffer import UNDELAYED, DelayedReplayBuffer
+from sb3_said.delays.space import UNDELAYED
+from sb3_said.replay.buffer import DelayedReplayBuffer
 
 MILLION = 1_000_000
 EPISODE_LENGTH = 1000

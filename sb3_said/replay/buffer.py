@@ -12,15 +12,11 @@ from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_said.delays.space import check_spaces
+from sb3_said.delays.space import EXECUTED, UNDELAYED, check_spaces
 from sb3_said.files.registry import register_class
 from sb3_said.planner.values import average_reward_tail, discounted_values, normalise_values
 from sb3_said.replay.windows import Windows, WindowSource
 
-#: Key of the true state in ``info`` and in sampled observations; never part of an environment's observation space.
-UNDELAYED = "undelayed_observation"
-#: Key in ``info`` of what the task was given, where that is not the action sent last.
-EXECUTED = "executed_action"
 _ROW_ARRAYS = ("observations", "actions", "rewards", "dones", "timeouts", "ages", "steps", "tail_slots")
 
 
@@ -45,7 +41,7 @@ class DelayedReplayBuffer(ReplayBuffer):
     :param n_envs: parallel environments
     :param optimize_memory_usage: accepted for SB3's sake; must be False, as memory is optimized anyway
     :param handle_timeout_termination: bootstrap at time limits
-    :param exchanged_ages: part of the sampled transitions that are shown as they would have been observed at another
+    :param relabelled_ages: part of the sampled transitions that are shown as they would have been observed at another
         one's age, in [0, 1]. The true states are all known, so that an episode under one delay teaches the others too;
         where there is but one delay, nothing changes
     :raises ValueError: for other spaces, a part outside [0, 1], or when the buffer cannot hold more steps than the
@@ -63,15 +59,15 @@ class DelayedReplayBuffer(ReplayBuffer):
         n_envs: int = 1,
         optimize_memory_usage: bool = False,
         handle_timeout_termination: bool = True,
-        exchanged_ages: float = 0.0,
+        relabelled_ages: float = 0.0,
     ):
         BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_envs=n_envs)
         if optimize_memory_usage:
             raise ValueError("DelayedReplayBuffer stores each state once already; leave optimize_memory_usage=False.")
         self.optimize_memory_usage = False
-        if not 0.0 <= exchanged_ages <= 1.0:
-            raise ValueError(f"exchanged_ages is a part of the transitions in [0, 1], got {exchanged_ages}.")
-        self.exchanged_ages = exchanged_ages
+        if not 0.0 <= relabelled_ages <= 1.0:
+            raise ValueError(f"relabelled_ages is a part of the transitions in [0, 1], got {relabelled_ages}.")
+        self.relabelled_ages = relabelled_ages
         self.handle_timeout_termination = handle_timeout_termination
         self.buffer_size = max(buffer_size // n_envs, 1)
         self.is_delayed = isinstance(observation_space, spaces.Dict)
@@ -266,8 +262,8 @@ class DelayedReplayBuffer(ReplayBuffer):
             return ReplayBufferSamples(*(self.to_torch(np.asarray(part)) for part in data))
 
         ages = self.ages[rows, envs]
-        if self.exchanged_ages > 0.0:
-            self._exchange(ages, next_ages, self.steps[rows, envs])
+        if self.relabelled_ages > 0.0:
+            self._relabel(ages, next_ages, self.steps[rows, envs])
         history = self._histories(rows, envs)  # (B, D, act_dim)
         next_history = np.concatenate([history, actions[:, None]], axis=1)[:, 1:]
         past = self.observations[(rows + 1 - next_ages) % self.buffer_size, envs]  # (B, obs_dim)
@@ -304,7 +300,7 @@ class DelayedReplayBuffer(ReplayBuffer):
         states[newest], ages[newest] = self._next_states[envs[newest]], self._next_ages[envs[newest]]
         return states, ages
 
-    def _exchange(self, ages: np.ndarray, next_ages: np.ndarray, steps: np.ndarray) -> None:
+    def _relabel(self, ages: np.ndarray, next_ages: np.ndarray, steps: np.ndarray) -> None:
         """Give a part of the transitions the ages of others, in place, but none that reach before their episode.
 
         A pair (age, next age) stays together: so ages change from step to step as they do in play. Ages that only the
@@ -314,7 +310,7 @@ class DelayedReplayBuffer(ReplayBuffer):
         :param next_ages: (B,)
         :param steps: (B,) of each transition within its episode
         """
-        takers = np.flatnonzero(np.random.random(len(ages)) < self.exchanged_ages)
+        takers = np.flatnonzero(np.random.random(len(ages)) < self.relabelled_ages)
         givers = np.flatnonzero(ages < steps)
         if givers.size:
             drawn = np.random.choice(givers, takers.size)

@@ -8,27 +8,19 @@ import warnings
 from typing import Any, ClassVar
 
 import numpy as np
-import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import (
-    DictReplayBufferSamples,
     GymEnv,
-    ReplayBufferSamples,
     RolloutReturn,
     Schedule,
 )
-from stable_baselines3.common.utils import polyak_update
 
-from sb3_said.delays.ages import ages_of, written_ages
-from sb3_said.delays.space import check_spaces
+from sb3_said.delays.space import ages_of, check_spaces, written_ages
 from sb3_said.files.agents import PickleRefusedError, SafeSaveMixin, explained_refusal, load_tree, save_tree
-from sb3_said.planner.checks import check_choice
-from sb3_said.planner.precision import PRECISIONS, autocast
 from sb3_said.replay.buffer import DelayedReplayBuffer
-from sb3_said.sac.networks import FusedAdam, StackedCritic
 from sb3_said.sac.policies import DelayedSACPolicy
 
 
@@ -47,18 +39,16 @@ class DelayedSAC(SafeSaveMixin, SAC):
     ============= ============= =======================
 
     The critics' true states come from replay (they arrive a few steps later on a real system too); acting needs none.
-    On a task without ``DelayedObservationWrapper`` this is SB3's SAC, update for update, in less time.
+    On a task without ``DelayedObservationWrapper`` this is SB3's SAC, update for update.
 
     :param policy: ``"MultiInputPolicy"`` or ``"MlpPolicy"``, which name the same class
     :param env: a task in a ``DelayedObservationWrapper``, or one with a 1-D Box observation (delay 0)
     :param learning_rate: of actor, critics and entropy coefficient; a number or a schedule
     :param augment_state: the actor reads [observation, action history, age]
     :param delay_reconciled_critic: the critics read the true state
-    :param exchanged_ages: part of the transitions of an update that are seen at the age another was observed at, in
+    :param relabelled_ages: part of the transitions of an update that are seen at the age another was observed at, in
         [0, 1]: where delays vary, each step teaches the actor what to do under the others too. Measured at delays 0..16
         (results/README.md); 0 is SADR as published, and under one fixed delay there is no difference
-    :param precision: of the matrix products between hidden layers in updates: ``"float32"``; ``"bfloat16"``, which is
-        faster; or ``"auto"``, bfloat16 where the hardware has it. All else, acting and gSDE (``use_sde``) are float32
     :param sac_kwargs: every other argument of :class:`stable_baselines3.SAC`
     :raises ValueError: for spaces that are neither, a ``VecNormalize`` of more than the observation, or options that
         need another replay buffer (``n_steps`` > 1) or policy
@@ -69,8 +59,6 @@ class DelayedSAC(SafeSaveMixin, SAC):
         "MultiInputPolicy": DelayedSACPolicy,
     }
     policy: DelayedSACPolicy
-    critic: StackedCritic
-    critic_target: StackedCritic
     replay_buffer: DelayedReplayBuffer
 
     def __init__(
@@ -81,22 +69,17 @@ class DelayedSAC(SafeSaveMixin, SAC):
         *,
         augment_state: bool = True,
         delay_reconciled_critic: bool = True,
-        exchanged_ages: float = 0.5,
-        precision: str = "float32",
+        relabelled_ages: float = 0.5,
         **sac_kwargs: Any,
     ):
         if sac_kwargs.get("n_steps", 1) != 1:
             raise ValueError(
                 f"DelayedSAC learns from one-step targets, got n_steps={sac_kwargs['n_steps']}; leave it 1."
             )
-        check_choice("precision", precision, PRECISIONS)
-        if precision == "bfloat16" and sac_kwargs.get("use_sde"):
-            raise ValueError('gSDE is computed in float32: give precision="float32" or "auto" with use_sde=True.')
-        self.precision = precision
         self.trained_ages: list[int] | None = None  # of the observations it has learned from last, amid episodes
         self.augment_state = augment_state
         self.delay_reconciled_critic = delay_reconciled_critic
-        self.exchanged_ages = exchanged_ages
+        self.relabelled_ages = relabelled_ages
         if isinstance(policy, str):  # SB3 would refuse one of the two names, by the kind of space
             policy = self.policy_aliases.get(policy, policy)  # type: ignore[assignment]
         super().__init__(policy, env, learning_rate, **sac_kwargs)
@@ -105,11 +88,9 @@ class DelayedSAC(SafeSaveMixin, SAC):
         self._check_parts()
         user_kwargs = self.policy_kwargs, self.replay_buffer_kwargs
         self.policy_kwargs = {**self.policy_kwargs, **self._policy_flags()}
-        self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "exchanged_ages": self.exchanged_ages}
+        self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "relabelled_ages": self.relabelled_ages}
         super()._setup_model()
         self.policy_kwargs, self.replay_buffer_kwargs = user_kwargs
-        if self.log_ent_coef is not None:
-            self.ent_coef_optimizer = FusedAdam([self.log_ent_coef], lr=self.lr_schedule(1))
 
     def _check_parts(self) -> None:
         """:raises ValueError: for a policy, a replay buffer or a normalisation that does not go with delays"""
@@ -127,8 +108,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
             )
         if twice := sorted(self._policy_flags().keys() & self.policy_kwargs.keys()):
             raise ValueError(f"Give {', '.join(twice)} to {name} itself, not in policy_kwargs.")
-        if "exchanged_ages" in self.replay_buffer_kwargs:
-            raise ValueError(f"Give exchanged_ages to {name} itself, not in replay_buffer_kwargs.")
+        if "relabelled_ages" in self.replay_buffer_kwargs:
+            raise ValueError(f"Give relabelled_ages to {name} itself, not in replay_buffer_kwargs.")
         vec_normalize = self.get_vec_normalize_env()
         if isinstance(self.observation_space, spaces.Dict) and vec_normalize is not None and vec_normalize.norm_obs:
             keys = vec_normalize.norm_obs_keys or []
@@ -223,75 +204,6 @@ class DelayedSAC(SafeSaveMixin, SAC):
     def _serves(self, ages: list[int]) -> bool:
         """Tell whether answers are as good at ages that training did not bring."""
         return False
-
-    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """Update critics, actor, entropy coefficient and target critics ``gradient_steps`` times, as SAC does."""
-        self.policy.set_training_mode(True)
-        optimizers = [self.actor.optimizer, self.critic.optimizer]
-        if self.ent_coef_optimizer is not None:
-            optimizers.append(self.ent_coef_optimizer)
-        self._update_learning_rate(optimizers)
-
-        losses = []  # read at the end: a read per update would make a GPU wait
-        for gradient_step in range(gradient_steps):
-            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
-            with autocast("float32" if self.use_sde else self.precision, self.device):
-                losses.append(self._update(batch))
-            if gradient_step % self.target_update_interval == 0:
-                self._update_targets()
-        self._n_updates += gradient_steps
-
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        names = ("ent_coef", "actor_loss", "critic_loss", "ent_coef_loss")
-        for name, mean in zip(names, th.stack(losses).mean(0).tolist(), strict=False):
-            self.logger.record(f"train/{name}", mean)
-
-    def _update(self, batch: ReplayBufferSamples | DictReplayBufferSamples) -> th.Tensor:
-        """Make one update of critics, actor and entropy coefficient.
-
-        :return: (3,) or (4,): entropy coefficient, losses of actor and critics, and of the coefficient if it is learned
-        """
-        # dones of shape (B, 1) leave out those due to time limits
-        rewards, discounts = batch.rewards[:, 0], self.gamma * (1 - batch.dones[:, 0])  # (B,)
-        if self.use_sde:
-            self.actor.reset_noise()
-        actions, log_prob = self.actor.action_log_prob(batch.observations)  # (B, act_dim), (B,)
-
-        # Entropy coefficient: towards the target entropy. Its old value serves the losses below.
-        ent_coef_losses = []
-        if self.log_ent_coef is None or self.ent_coef_optimizer is None:
-            ent_coef = self.ent_coef_tensor
-        else:
-            ent_coef = self.log_ent_coef.detach().exp()
-            assert isinstance(self.target_entropy, float)  # for mypy: set up by SB3
-            too_certain = (log_prob.detach() + self.target_entropy).mean()
-            ent_coef_losses.append(-self.log_ent_coef.detach() * too_certain)
-            self.log_ent_coef.grad = -too_certain.view(1)
-            self.ent_coef_optimizer.step()
-
-        # Critics: towards the reward and the soft value of the next state, the smallest of the target critics'
-        with th.no_grad():
-            next_actions, next_log_prob = self.actor.action_log_prob(batch.next_observations)
-            next_q = self.critic_target.q_values(batch.next_observations, next_actions).amin(0)  # (B,)
-            target = rewards + discounts * (next_q - ent_coef * next_log_prob)
-        errors = self.critic.q_values(batch.observations, batch.actions) - target  # (n_critics, B)
-        critic_loss = 0.5 * errors.square().mean(1).sum()
-        self.critic.optimizer.zero_grad()
-        critic_loss.backward()
-        self.critic.optimizer.step()
-
-        # Actor: towards actions of high value and entropy
-        q = self.critic.q_values(batch.observations, actions, frozen=True).amin(0)
-        actor_loss = (ent_coef * log_prob - q).mean()
-        self.actor.optimizer.zero_grad()
-        actor_loss.backward()
-        self.actor.optimizer.step()
-        return th.stack([loss.detach().view(()) for loss in (ent_coef, actor_loss, critic_loss, *ent_coef_losses)])
-
-    @th.no_grad()
-    def _update_targets(self) -> None:
-        th._foreach_lerp_(list(self.critic_target.parameters()), list(self.critic.parameters()), self.tau)
-        polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """Write the replay buffer to a file without pickle.

@@ -7,16 +7,15 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
 
-from sb3_said.delays.space import check_spaces
+from sb3_said.delays.space import UNDELAYED, check_spaces
 from sb3_said.files.agents import SafePolicyMixin
 from sb3_said.files.registry import register_class
-from sb3_said.replay.buffer import UNDELAYED
 from sb3_said.sac.extractors import KeyExtractor, StateAugmentedExtractor
-from sb3_said.sac.networks import FusedAdam, StackedActor, StackedCritic
 
 
 @register_class
@@ -29,9 +28,6 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
     :param policy_kwargs: of ``SACPolicy``
     :raises ValueError: for other spaces, or when a features extractor is given or shared in a delayed task
     """
-
-    critic: StackedCritic
-    critic_target: StackedCritic
 
     def __init__(
         self,
@@ -59,13 +55,6 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
                     "share_features_extractor=False."
                 )
             self.replay_space = spaces.Dict({**observation_space.spaces, UNDELAYED: state_space})
-        if policy_kwargs.get("optimizer_class", th.optim.Adam) is th.optim.Adam:
-            policy_kwargs["optimizer_class"] = FusedAdam
-        elif (policy_kwargs.get("optimizer_kwargs") or {}).get("fused"):
-            raise ValueError(
-                f"A fused {policy_kwargs['optimizer_class'].__name__} does not tell that it has changed the weights; "
-                "leave fused out of optimizer_kwargs, or take Adam, which is fused here."
-            )
         super().__init__(observation_space, action_space, lr_schedule, **policy_kwargs)
 
     def _actor_extractor(self) -> BaseFeaturesExtractor | None:
@@ -83,16 +72,12 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         if self.replay_space is not None:
             self.actor_kwargs["observation_space"] = self.replay_space
-        if self.actor_kwargs["use_sde"]:
-            return super().make_actor(features_extractor or self._actor_extractor())
-        kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor or self._actor_extractor())
-        return StackedActor(**kwargs).to(self.device)
+        return super().make_actor(features_extractor or self._actor_extractor())
 
-    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> StackedCritic:
+    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
         if self.replay_space is not None:
             self.critic_kwargs["observation_space"] = self.replay_space
-        kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor or self._critic_extractor())
-        return StackedCritic(**kwargs).to(self.device)
+        return super().make_critic(features_extractor or self._critic_extractor())
 
     def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
         """Turn what ``predict`` was given into float32 tensors of their own memory, after checking it.

@@ -14,10 +14,9 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
-from sb3_said.delays.space import check_spaces, has_state_history
+from sb3_said.delays.space import UNDELAYED, check_spaces, has_state_history
 from sb3_said.files.registry import register_class
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
-from sb3_said.replay.buffer import UNDELAYED
 from sb3_said.sac.policies import DelayedSACPolicy
 
 Answer = Literal["planner", "expert"]
@@ -107,7 +106,7 @@ class SAIDPolicy(DelayedSACPolicy):
         """
         flat = states.flatten(0, -2)
         observation: PyTorchObs = flat if self.replay_space is None else {UNDELAYED: flat}
-        return self.critic.q_values(observation, actions.flatten(0, -2)).amin(0).view(states.shape[:-1])
+        return th.cat(self.critic(observation, actions.flatten(0, -2)), dim=1).amin(1).view(states.shape[:-1])
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         who = self.who_answers

@@ -15,8 +15,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import configure_logger
 
-from sb3_said.delays.ages import ages_of, written_ages
-from sb3_said.delays.space import has_state_history
+from sb3_said.delays.space import ages_of, has_state_history, written_ages
 from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.sac import DelayedSAC

@@ -24,8 +24,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_said import DelayedSAC
 from sb3_said.delays import DelayProcess, FixedDelay
-from sb3_said.delays.ages import ages_of
-from sb3_said.delays.space import has_state_history
+from sb3_said.delays.space import ages_of, has_state_history
 from sb3_said.evaluation.rollout import Observation
 from sb3_said.said.policies import Answer
 from sb3_said.zoo.manager import ALGOS, WRAPPER, Delay, largest_delay

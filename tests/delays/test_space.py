@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from counting_task import OBS_DIM, CountingTask
 from gymnasium import spaces
+from small_task import Drift, LateDelay, OwnDelay, delayed
+from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_said.delays import DelayedObservationWrapper
-from sb3_said.delays.space import check_spaces, has_state_history
+from sb3_said.delays import DelayedObservationWrapper, TotalDelay
+from sb3_said.delays.space import ages_of, check_spaces, has_state_history, written_ages
 
 
 @pytest.mark.parametrize(
@@ -37,3 +39,34 @@ def test_a_delayed_task_tells_its_states_and_its_largest_delay(delay, max_delay,
     assert has_state_history(env.observation_space) == state_history
     assert check_spaces(task.observation_space, task.action_space) == (states, 0)
     assert not has_state_history(task.observation_space)
+
+
+@pytest.mark.parametrize(
+    ("env", "ages"),
+    [
+        (None, [0]),
+        (Drift(), [0]),
+        (delayed(2), [2]),
+        (delayed(1, max_delay=2), [1]),
+        (delayed((0, 2)), [0, 1, 2]),
+        (delayed(TotalDelay(1, 1)), [2]),
+        (delayed(OwnDelay()), [0, 1, 2]),  # does not say its smallest
+        (delayed(LateDelay()), [1, 2]),
+    ],
+    ids=str,
+)
+def test_of_one_environment_and_of_several_alike(env, ages):
+    assert ages_of(env) == ages
+    if env is not None:
+        assert ages_of(DummyVecEnv([lambda: env])) == ages
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_each_of_several_environments_has_ages_of_its_own(first):
+    envs = [lambda: delayed(0, max_delay=3), lambda: delayed((2, 3))]
+    assert ages_of(DummyVecEnv([envs[first], envs[1 - first]])) == [0, 2, 3]
+
+
+@pytest.mark.parametrize(("ages", "text"), [([3], "3"), ([2, 3], "2, 3"), ([0, 1, 2], "0..2"), ([0, 2, 3], "0, 2, 3")])
+def test_written_ages(ages, text):
+    assert written_ages(ages) == text

@@ -15,8 +15,9 @@ from stable_baselines3.common.save_util import load_from_pkl, save_to_pkl
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_said.delays import UniformDelay
+from sb3_said.delays.space import UNDELAYED
 from sb3_said.files.agents import load_tree, save_tree
-from sb3_said.replay.buffer import UNDELAYED, DelayedReplayBuffer
+from sb3_said.replay.buffer import DelayedReplayBuffer
 
 
 def make_buffer(player, steps_per_env=20, buffer_class=DelayedReplayBuffer, **kwargs):
@@ -131,11 +132,11 @@ def pasts_and_rows(rows):
 
 @settings(max_examples=150, deadline=None)
 @given(players_and_sizes(), st.integers(1, 90), st.sampled_from([0.3, 1.0]))
-def test_exchanged_ages_show_what_would_have_been_observed_at_them(player_and_size, n_steps, part):
+def test_relabelled_ages_show_what_would_have_been_observed_at_them(player_and_size, n_steps, part):
     player, steps_per_env = player_and_size
     rows = player.play(n_steps)
     found = pasts_and_rows(rows)
-    sampled = batch_arrays(fill(make_buffer(player, steps_per_env, exchanged_ages=part), rows).sample(300))
+    sampled = batch_arrays(fill(make_buffer(player, steps_per_env, relabelled_ages=part), rows).sample(300))
     ages, next_ages = (sampled[f"{name}/delay"][:, 0].astype(int) for name in ("observations", "next_observations"))
     assert np.all(next_ages <= ages + 1)
     for i, tag in enumerate(sampled[f"observations/{UNDELAYED}"][:, 0].astype(int)):
@@ -154,7 +155,7 @@ def test_that_part_of_the_ages_is_exchanged(part):
     rows = player.play(1500)
     found = pasts_and_rows(rows)
     np.random.seed(0)
-    sampled = batch_arrays(fill(make_buffer(player, 2000, exchanged_ages=part), rows).sample(20_000))
+    sampled = batch_arrays(fill(make_buffer(player, 2000, relabelled_ages=part), rows).sample(20_000))
     transitions = [found[tag] for tag in sampled[f"observations/{UNDELAYED}"][:, 0]]
     late = np.array([len(states) > 6 for states, _, _ in transitions])  # before, the largest ages do not fit
     own = np.array([row.obs["delay"][env, 0] for _, row, env in transitions])[late]
@@ -170,7 +171,7 @@ def test_that_part_of_the_ages_is_exchanged(part):
 def test_of_one_delay_there_is_nothing_to_exchange(delay, max_length, seed):
     player = Player(delay=delay, max_delay=5, max_length=max_length, seed=seed)
     rows = player.play(60)
-    assert_exact(fill(make_buffer(player, 20, exchanged_ages=1.0), rows), rows)
+    assert_exact(fill(make_buffer(player, 20, relabelled_ages=1.0), rows), rows)
 
 
 @settings(max_examples=60, deadline=None)
@@ -450,7 +451,7 @@ def test_a_buffer_shorter_than_the_delay_names_the_smallest_that_works(n_envs):
 @pytest.mark.parametrize("part", [-0.1, 1.5])
 def test_only_a_part_of_the_ages_can_be_exchanged(part):
     with pytest.raises(ValueError, match=r"in \[0, 1\]"):
-        make_buffer(Player(), exchanged_ages=part)
+        make_buffer(Player(), relabelled_ages=part)
 
 
 def test_an_empty_buffer_has_nothing_to_give():

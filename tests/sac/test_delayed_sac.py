@@ -24,8 +24,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.delays import TotalDelay, UniformDelay
+from sb3_said.delays.space import UNDELAYED
 from sb3_said.planner.precision import has_bfloat16
-from sb3_said.replay.buffer import UNDELAYED
 
 AUGMENTED = {"observation", "action_history", "delay"}
 
@@ -198,11 +198,11 @@ def test_every_argument_has_a_default_and_is_an_attribute():
     parameters = list(inspect.signature(DelayedSAC.__init__).parameters.values())[3:]
     own = [p for p in parameters if p.kind is not p.VAR_KEYWORD]
     assert [p.name for p in own] == [
-        "learning_rate", "augment_state", "delay_reconciled_critic", "exchanged_ages", "precision"
+        "learning_rate", "augment_state", "delay_reconciled_critic", "relabelled_ages", "precision"
     ]  # fmt: skip
     assert all(p.default is not p.empty for p in own)
     given = {"learning_rate": 0.01, "augment_state": False, "delay_reconciled_critic": False, "tau": 0.1, "gamma": 0.9}
-    given |= {"precision": "float32", "exchanged_ages": 0.1}
+    given |= {"precision": "float32", "relabelled_ages": 0.1}
     assert {name: getattr(make(**given), name) for name in given} == given
 
 
@@ -315,10 +315,10 @@ def test_the_seed_decides():
 
 @pytest.mark.parametrize("part", [0.0, 0.3])
 def test_ages_are_exchanged_as_asked_also_after_loading(part, tmp_path):
-    make(delayed(delay=(0, 2)), exchanged_ages=part).save(tmp_path / "agent.zip")
+    make(delayed(delay=(0, 2)), relabelled_ages=part).save(tmp_path / "agent.zip")
     model = DelayedSAC.load(tmp_path / "agent.zip", delayed(delay=(0, 2)), device="cpu")
-    assert model.replay_buffer.exchanged_ages == part
-    assert make(delayed(delay=(0, 2))).replay_buffer.exchanged_ages == 0.5
+    assert model.replay_buffer.relabelled_ages == part
+    assert make(delayed(delay=(0, 2))).replay_buffer.relabelled_ages == 0.5
     assert model.replay_buffer_kwargs == {}  # as the user gave it
 
 
@@ -501,8 +501,8 @@ def test_replay_is_saved_without_pickle(tmp_path):
         ({"policy_kwargs": {"share_features_extractor": True}}, "share_features_extractor"),
         ({"policy_kwargs": {"features_extractor_class": CombinedExtractor}}, "features_extractor_class"),
         ({"policy_kwargs": {"augment_state": False}}, "augment_state to DelayedSAC itself"),
-        ({"exchanged_ages": 2.0}, r"in \[0, 1\]"),
-        ({"replay_buffer_kwargs": {"exchanged_ages": 1.0}}, "exchanged_ages to DelayedSAC itself"),
+        ({"relabelled_ages": 2.0}, r"in \[0, 1\]"),
+        ({"replay_buffer_kwargs": {"relabelled_ages": 1.0}}, "relabelled_ages to DelayedSAC itself"),
         ({"policy": "CnnPolicy"}, "CnnPolicy"),
         ({"buffer_size": 3}, "buffer_size"),
         ({"env": VecNormalize(make_vec_env(delayed))}, r"norm_obs_keys=\['observation'\]"),
