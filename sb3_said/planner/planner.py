@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Hashable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch as th
 from torch import nn
@@ -13,12 +12,14 @@ from torch import nn
 from sb3_said.planner import diffusion, inpainting
 from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.dit import DiT1d
+from sb3_said.planner.graphs import RecordedFunction
 from sb3_said.planner.normalizer import Normalizer
-from sb3_said.planner.precision import autocast, compute_dtype
-from sb3_said.planner.sampling import Prepared, SamplingCache, addresses, is_frozen
+from sb3_said.planner.precision import autocast
 from sb3_said.replay.windows import Windows
 
 ValueFn = Callable[[th.Tensor, th.Tensor], th.Tensor]
+
+MAX_GRAPHS = 8  # of a GPU; each keeps the memory of one decision
 
 
 class Plan(NamedTuple):
@@ -63,23 +64,37 @@ class InpaintingPlanner(nn.Module):
             self.window_length,
             config.d_model,
             config.depth,
-            config.positions,
             config.embed_known,
             config.extra_state_probability > 0,
         )
         self.normalizer = Normalizer(
             obs_dim, act_dim, self.window_length, config.action_transform, config.relative_states
         )
-        self._cache = SamplingCache()
+        self._graphs: dict[Hashable, RecordedFunction] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_graphs": {}}  # a copy records its own
 
     @property
     def device(self) -> th.device:
         """Where the planner lives."""
         return self.normalizer.state_mean.device
 
-    def autocast(self) -> AbstractContextManager[object]:
-        """Return the context of ``config.precision`` here; :meth:`loss` enters it itself."""
-        return autocast(self.config.precision, self.device)
+    def check_ages(self, ages: Sequence[int]) -> None:
+        """Refuse ages amid an episode that the network was not trained to plan at.
+
+        :param ages: in control steps
+        :raises ValueError: for ages above ``max_delay``; with ``mask="fixed"``, for any other than ``max_delay``
+        """
+        if self.config.mask == "fixed" and any(age != self.max_delay for age in ages):
+            raise ValueError(
+                f"A planner with mask='fixed' plans at age {self.max_delay} only, got {', '.join(map(str, ages))}; "
+                "train one with mask='random', which plans at every age up to the largest."
+            )
+        if max(ages, default=0) > self.max_delay:
+            raise ValueError(
+                f"This planner plans at ages 0..{self.max_delay}, got {max(ages)}; build one with a larger max_delay."
+            )
 
     def fit_normalizer(self, states: th.Tensor, actions: th.Tensor, windows: Windows | None = None) -> None:
         """Set the mean and standard deviation that states and (transformed) actions are z-scored with.
@@ -145,8 +160,8 @@ class InpaintingPlanner(nn.Module):
         )
         alpha, sigma = (factor[:, None, None] for factor in diffusion.alpha_sigma(t, config.schedule))
         x = th.where(known, clean, diffusion.add_noise(clean, noise, alpha, sigma))
-        with self.autocast():
-            network = self.network
+        network = self.network
+        with autocast(config.precision, device):
             output = network(x, network.context(clean, known), network.modulations(t), valid)
         target = diffusion.prediction_target(clean, noise, alpha, sigma, config.prediction)
         learned = valid[..., None] & ~known
@@ -179,11 +194,12 @@ class InpaintingPlanner(nn.Module):
         The arguments that default to ``None`` take the config's value. One candidate is enough, and drawn, where the
         others could not matter: at temperature 0, where all are alike, and by default without a ``value_fn``.
 
-        Freeze a trained planner with ``requires_grad_(False)``: only then is what depends on the weights alone kept
-        from one call to the next. On a GPU its whole decision is one CUDA graph, made at the first call with these
-        sizes and settings, if the ``value_fn`` is a module or a method of one, which must then never wait for the
-        device. Any other ``value_fn`` may read what a graph would not see change: its plans are made operation by
-        operation.
+        On a GPU a decision becomes one recorded graph after a few calls with these sizes and settings, if the
+        ``value_fn`` is a module or a method of one, which must then never wait for the device. Any other ``value_fn``
+        may read what a graph would not see change: its plans are made operation by operation.
+
+        A planner with ``mask="fixed"`` has known ``max_delay`` actions in every window. At an episode's start, s_0
+        stands for s_{t-D} and zeros for the actions before it (paper, Appendix B).
 
         :param observation: (B, obs_dim) delayed observations s_{t-d}
         :param action_history: (B, D, act_dim), the D newest actions, oldest first
@@ -208,7 +224,7 @@ class InpaintingPlanner(nn.Module):
         _check("observation", observation, (None, self.obs_dim))
         n = len(observation)
         _check("action_history", action_history, (n, self.max_delay, self.act_dim))
-        delay = self._delay(delay, n)
+        delay = self._trained_delay(self._delay(delay, n), action_history)
         extra_states = self._extra_states(state_history, state_known, n)
         shortest, longest = int(delay.min()), int(delay.max())
         length = longest + config.horizon  # a decision costs what its age costs
@@ -224,43 +240,44 @@ class InpaintingPlanner(nn.Module):
             raise ValueError(
                 f"n_candidates is {n_candidates} and temperature {temperature}, expected at least 1 and at least 0."
             )
-        steps = diffusion.solver_steps(
-            config.solver,
-            config.schedule,
-            config.sampling_steps if sampling_steps is None else sampling_steps,
-            config.time_grid,
-        )
+        n_steps = config.sampling_steps if sampling_steps is None else sampling_steps
+        steps = diffusion.solver_steps(config.schedule, n_steps)
 
         if temperature == 0:
             x = th.zeros(n, 1, *shape, device=self.device)
         else:
             noise = self._noise((n, n_candidates, *shape), generator) if noise is None else noise
             x = temperature * noise.expand(n, -1, -1, -1)  # (B, N, L, obs_dim + act_dim)
-        n_tokens = x.shape[0] * x.shape[1] * self.window_length  # of the largest age, so that all have one format
-        dtype = compute_dtype(config.precision, self.device, n_tokens * config.d_model)
-        prepared = self._cache.prepare(self, self.network, steps, dtype)
-        inputs = (observation, action_history, delay, x, *extra_states)
-        if self._can_be_graphed(value_fn):
-            key = (config, tuple(x.shape), value_fn, addresses(self if value_fn is None else _owner(value_fn)))
-            graph = self._cache.graph(key, partial(self._inpaint, prepared, steps, value_fn, 0, True), inputs)
-            plan = Plan(*graph(*inputs))
+        times = th.tensor([step.t for step in steps], device=self.device)
+        inputs = (times, observation, action_history, delay, x, *extra_states)
+        if self.device.type == "cuda" and (value_fn is None or isinstance(_owner(value_fn), nn.Module)):
+            plan = Plan(*self._graph(steps, value_fn, x.shape)(*inputs))
         else:
-            plan = self._inpaint(prepared, steps, value_fn, shortest, longest > shortest, *inputs)
+            plan = self._inpaint(steps, value_fn, shortest, longest > shortest, *inputs)
         if plan.values.isnan().any():
             raise ValueError("value_fn returned NaN, so that no candidate is the best; check the critic.")
         return plan
 
-    def _can_be_graphed(self, value_fn: ValueFn | None) -> bool:
-        is_module = value_fn is None or isinstance(_owner(value_fn), nn.Module)
-        return self.device.type == "cuda" and is_module and is_frozen(self)
+    def _graph(
+        self, steps: Sequence[diffusion.SolverStep], value_fn: ValueFn | None, shape: th.Size
+    ) -> RecordedFunction:
+        """Return the graph of decisions with these settings and sizes, and with the weights where they now lie."""
+        modules: list[Any] = [self] if value_fn is None else [self, _owner(value_fn)]
+        tensors = [tensor for module in modules for tensor in (*module.parameters(), *module.buffers())]
+        key = (self.config, steps, value_fn, shape, tuple(tensor.data_ptr() for tensor in tensors))
+        if key not in self._graphs:
+            if len(self._graphs) == MAX_GRAPHS:
+                del self._graphs[next(iter(self._graphs))]  # the oldest
+            self._graphs[key] = RecordedFunction(partial(self._inpaint, steps, value_fn, 0, True), self.device)
+        return self._graphs[key]
 
     def _inpaint(
         self,
-        prepared: Prepared,
         steps: Sequence[diffusion.SolverStep],
         value_fn: ValueFn | None,
         shortest: int,
         is_mixed: bool,
+        times: th.Tensor,
         observation: th.Tensor,
         action_history: th.Tensor,
         delay: th.Tensor,
@@ -272,6 +289,7 @@ class InpaintingPlanner(nn.Module):
 
         :param shortest: a lower bound of the delays: no state before it is scored
         :param is_mixed: whether delays may differ, so that some windows end before others
+        :param times: (n_steps,) of the steps
         :param x: (B, N, L, obs_dim + act_dim) initial noise, scaled
         :param state_history: (B, D, obs_dim), and which of it is known: ``state_known``, (B, D) bool
         """
@@ -280,15 +298,19 @@ class InpaintingPlanner(nn.Module):
         known = inpainting.known_mask(delay, length, self.obs_dim, self.act_dim, state_known)
         clean = self.normalizer.normalize(*self._split(given))  # (B, L, obs_dim + act_dim), as given and known
         valid = self._within(delay, length).repeat_interleave(x.shape[1], 0) if is_mixed else None  # (B * N, L)
-        network, modulations = prepared
+        network = self.network
+        modulations = network.modulations(times)  # (n_steps, 6 * depth + 2, d_model)
         context = network.context(clean, known)
-        x = diffusion.solve(
-            lambda x, i: network(x.flatten(0, 1), context, modulations[i], valid).float().view_as(x),
-            x,
-            steps,
-            self.config.prediction,
-            impose=lambda x: th.where(known[:, None], clean[:, None], x),
-        )
+        # Of the largest age, so that decisions at all ages have one number format
+        size = x.shape[0] * x.shape[1] * self.window_length * self.config.d_model
+        with autocast(self.config.precision, x.device, size):
+            x = diffusion.solve(
+                lambda x, i: network(x.flatten(0, 1), context, modulations[i], valid).float().view_as(x),
+                x,
+                steps,
+                self.config.prediction,
+                impose=lambda x: th.where(known[:, None], clean[:, None], x),
+            )
         # What is given comes back exactly as given, without the rounding of the normaliser
         x = th.where(known[:, None], given[:, None], th.cat(self.normalizer.denormalize(x), dim=-1))
         states, actions = self._split(x)
@@ -360,6 +382,18 @@ class InpaintingPlanner(nn.Module):
                 "planner with a larger max_delay."
             )
         return delay.to(self.device, th.int64)
+
+    def _trained_delay(self, delay: th.Tensor, action_history: th.Tensor) -> th.Tensor:
+        """Return the delays to plan with: (B,) int64; with ``mask="fixed"`` D, at the start of an episode too.
+
+        :raises ValueError: for a younger observation amid an episode, which that mask was not trained for
+        """
+        if self.config.mask == "random":
+            return delay
+        older = th.arange(self.max_delay, device=delay.device) < self.max_delay - delay[:, None]  # (B, D)
+        amid = (action_history.ne(0).any(-1) & older).any(1)  # (B,): acted on longer ago than the observation is old
+        self.check_ages(delay[amid].tolist())
+        return th.full_like(delay, self.max_delay)
 
     def _extra_states(
         self, state_history: th.Tensor | None, state_known: th.Tensor | None, batch_size: int

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,6 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_said.delays.space import EXECUTED, UNDELAYED, check_spaces
 from sb3_said.files.registry import register_class
-from sb3_said.planner.values import average_reward_tail, discounted_values, normalise_values
 from sb3_said.replay.windows import Windows, WindowSource
 
 _ROW_ARRAYS = ("observations", "actions", "rewards", "dones", "timeouts", "ages", "steps", "tail_slots")
@@ -334,25 +332,14 @@ class DelayedReplayBuffer(ReplayBuffer):
 
     # ------------------------------------------------------------------------------------------------ windows
 
-    def window_source(
-        self,
-        newest_fraction: float = 1.0,
-        gamma: float = 0.99,
-        terminal_penalty: float | None = -100.0,
-        value_fn: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
-        env: VecNormalize | None = None,
-    ) -> WindowSource:
-        """Return every place a planner's window can start, over this buffer's own arrays.
+    def window_source(self, newest_fraction: float = 1.0, env: VecNormalize | None = None) -> WindowSource:
+        """Return every place a planner's window can start, over this buffer's own arrays, all of value 0.
 
         The buffer must not grow while the source is in use.
 
         :param newest_fraction: use only the newest part of the buffer (the paper's 20 % is 0.2), in (0, 1]
-        :param gamma: discount of the windows' values
-        :param terminal_penalty: replaces the reward of a terminating step in the values (paper, Table 5); None keeps it
-        :param value_fn: (states (B, obs_dim), actions (B, act_dim)) -> (B,), bootstraps where an episode was cut off;
-            without it an episode is taken to go on at its average reward
         :param env: normalises states, as the expert's observations are
-        :raises ValueError: when the buffer is empty, the fraction is not in (0, 1], or gamma is 1 without ``value_fn``
+        :raises ValueError: when the buffer is empty, or the fraction is not in (0, 1]
         """
         if not 0.0 < newest_fraction <= 1.0:
             raise ValueError(f"newest_fraction is a part of the buffer in (0, 1], got {newest_fraction}.")
@@ -365,31 +352,22 @@ class DelayedReplayBuffer(ReplayBuffer):
         last = np.where(ends, np.arange(n_rows)[:, None], n_rows)
         last = np.minimum.accumulate(last[::-1], axis=0)[::-1]  # (T, n_envs): where each episode ends
 
-        terminated = (self.dones[rows] * (1 - self.timeouts[rows])) > 0
-        rewards = self.rewards[rows]
-        if terminal_penalty is not None:
-            rewards = np.where(terminated, terminal_penalty, rewards)
-        if value_fn is None:
-            tails = average_reward_tail(rewards, ends, gamma)
-        else:
-            tails = np.zeros_like(rewards)
-            t, e = np.nonzero(ends & ~terminated)
-            tails[t, e] = value_fn(self.observations[rows[t], e], self.actions[rows[t], e])
-        values = normalise_values(discounted_values(rewards, terminated, ends, tails, gamma))
-
         states = self.observations
         if env is not None and self.is_delayed:
             raw = {key: np.zeros((1, *space.shape), np.float32) for key, space in self.observation_space.items()}  # type: ignore[attr-defined]
             states = env.normalize_obs({**raw, "observation": states})["observation"]
         elif env is not None:
             states = env.normalize_obs(states)  # type: ignore[assignment]  # an array for an array
-        episodes = last + np.arange(self.n_envs) * n_rows  # unique for each environment and end
         grid = np.broadcast_to(rows[:, None], ends.shape), np.broadcast_to(np.arange(self.n_envs), ends.shape)
-        flat = (*grid, last - np.arange(n_rows)[:, None] + 1, values, episodes)
+        remaining = last - np.arange(n_rows)[:, None] + 1
+        episodes = last + np.arange(self.n_envs) * n_rows  # unique for each environment and end
+        per_start = (*grid, remaining, episodes, np.zeros(ends.shape, np.float32))
         return WindowSource(
             th.from_numpy(np.asarray(states, np.float32)),
             th.from_numpy(self.actions),
-            *(th.from_numpy(x.flatten()) for x in flat),  # a copy: the grid is read-only
+            th.from_numpy(self.rewards),
+            th.from_numpy((self.dones > 0) & (self.timeouts == 0)),
+            *(th.from_numpy(x.flatten()) for x in per_start),  # a copy: the grid is read-only
         )
 
     def sample_windows(self, batch_size: int, length: int, generator: th.Generator | None = None) -> Windows:
