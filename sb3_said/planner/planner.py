@@ -250,13 +250,16 @@ class InpaintingPlanner(nn.Module):
             x = temperature * noise.expand(n, -1, -1, -1)  # (B, N, L, obs_dim + act_dim)
         times = th.tensor([step.t for step in steps], device=self.device)
         inputs = (times, observation, action_history, delay, x, *extra_states)
-        if self.device.type == "cuda" and (value_fn is None or isinstance(_owner(value_fn), nn.Module)):
+        if self._can_be_recorded(value_fn):
             plan = Plan(*self._graph(steps, value_fn, x.shape)(*inputs))
         else:
             plan = self._inpaint(steps, value_fn, shortest, longest > shortest, *inputs)
         if plan.values.isnan().any():
             raise ValueError("value_fn returned NaN, so that no candidate is the best; check the critic.")
         return plan
+
+    def _can_be_recorded(self, value_fn: ValueFn | None) -> bool:
+        return self.device.type == "cuda" and (value_fn is None or isinstance(_owner(value_fn), nn.Module))
 
     def _graph(
         self, steps: Sequence[diffusion.SolverStep], value_fn: ValueFn | None, shape: th.Size

@@ -16,8 +16,9 @@ class PlannerTrainingCallback(BaseCallback):
 
     :param folder: keep a checkpoint of the planner's training there, and continue from it
     :param progress_bar: show one
-    :param intervals: in updates, ``log_interval``, ``eval_interval`` and ``save_interval`` of
+    :param intervals: in updates, ``log_interval``, ``eval_interval`` or ``save_interval`` of
         :meth:`~sb3_said.said.SAID.train_planner`
+    :raises TypeError: for another name
     """
 
     model: Any  # SAID, whose module imports this one
@@ -26,6 +27,8 @@ class PlannerTrainingCallback(BaseCallback):
         self, folder: str | Path | None = None, progress_bar: bool = False, verbose: int = 0, **intervals: int
     ):
         super().__init__(verbose)
+        if unknown := sorted(set(intervals) - {"log_interval", "eval_interval", "save_interval"}):
+            raise TypeError(f"PlannerTrainingCallback has no argument {', '.join(unknown)}.")
         self.how: dict[str, Any] = {"folder": folder, "progress_bar": progress_bar, **intervals}
 
     def _on_training_start(self) -> None:

@@ -17,6 +17,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from sb3_said.delays.space import UNDELAYED, check_spaces, has_state_history
 from sb3_said.files.registry import register_class
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
+from sb3_said.planner.graphs import EAGER_CALLS
 from sb3_said.sac.policies import DelayedSACPolicy
 
 Answer = Literal["planner", "expert"]
@@ -169,14 +170,14 @@ class SAIDPolicy(DelayedSACPolicy):
         space = self.observation_space
         parts = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
         arrays = {key: np.zeros((batch_size, *(part.shape or ())), np.float32) for key, part in parts.items()}
-        devices = [self.device] if self.device.type == "cuda" else []
-        with th.random.fork_rng(devices=devices):  # who draws actions afterwards draws the same
-            for delay, deterministic in product((0, self.max_delay), (True, False, True)):
+        on_gpu = self.device.type == "cuda"
+        calls = range(EAGER_CALLS + 1 if on_gpu else 1)
+        with th.random.fork_rng(devices=[self.device] if on_gpu else []):  # who draws afterwards draws the same
+            for delay, deterministic, _ in product((0, self.max_delay), (True, False), calls):
                 if "delay" in arrays:
                     arrays["delay"][:] = delay
-                self.predict(
-                    arrays if isinstance(space, spaces.Dict) else arrays["observation"], None, None, deterministic
-                )
+                obs = arrays if isinstance(space, spaces.Dict) else arrays["observation"]
+                self.predict(obs, deterministic=deterministic)
 
     def set_training_mode(self, mode: bool) -> None:
         super().set_training_mode(mode)
