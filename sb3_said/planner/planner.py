@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -10,14 +10,14 @@ import torch as th
 from torch import nn
 
 from sb3_said.planner import diffusion, inpainting
+from sb3_said.planner.checks import check_finite, check_shape, checked_delay
 from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.dit import DiT1d
 from sb3_said.planner.graphs import RecordedFunction
 from sb3_said.planner.normalizer import Normalizer
 from sb3_said.planner.precision import autocast
+from sb3_said.planner.selection import ValueFn, choose, mean_value, value_of
 from sb3_said.replay.windows import Windows
-
-ValueFn = Callable[[th.Tensor, th.Tensor], th.Tensor]
 
 MAX_GRAPHS = 8  # of a GPU; each keeps the memory of one decision
 
@@ -106,8 +106,8 @@ class InpaintingPlanner(nn.Module):
         :raises ValueError: for a wrong shape, no rows, or numbers that are not finite
         """
         states, actions = self._tensor(states), self._tensor(actions)
-        _check("states", states, (None, self.obs_dim))
-        _check("actions", actions, (len(states), self.act_dim))
+        check_finite("states", states, (None, self.obs_dim))
+        check_finite("actions", actions, (len(states), self.act_dim))
         self.normalizer.fit(states, actions)
         if windows is not None:
             self.normalizer.fit_moves(Windows(*(part.to(self.device) for part in windows)))
@@ -134,15 +134,15 @@ class InpaintingPlanner(nn.Module):
         """
         config, device = self.config, self.device
         states, actions = self._tensor(windows.states), self._tensor(windows.actions)
-        _check_shape("windows.states", states, (None, self.window_length, self.obs_dim))
+        check_shape("windows.states", states, (None, self.window_length, self.obs_dim))
         n = len(states)
-        _check_shape("windows.actions", actions, (n, self.window_length, self.act_dim))
+        check_shape("windows.actions", actions, (n, self.window_length, self.act_dim))
         if weight is not None:
-            _check_shape("weight", weight := self._tensor(weight), (n,))
+            check_shape("weight", weight := self._tensor(weight), (n,))
         if delay is None:
             delay = inpainting.draw_delays(n, self.max_delay, config.mask, config.mask_end_probability, generator)
         # Delays on a GPU are not read back: every update would wait for it, and a recorded one could not
-        delay = self._delay(delay, n) if delay.device.type == "cpu" else delay
+        delay = checked_delay(delay, n, self.max_delay).to(self.device) if delay.device.type == "cpu" else delay
         valid = windows.valid.to(device) & self._within(delay, self.window_length)  # (B, L)
         clean = self.normalizer.normalize(states, actions)  # (B, L, obs_dim + act_dim)
         # Steps behind an episode's end repeat its last row: they are neither shown as known nor learned, and no more
@@ -221,10 +221,10 @@ class InpaintingPlanner(nn.Module):
         """
         config = self.config
         observation, action_history = self._tensor(observation), self._tensor(action_history)
-        _check("observation", observation, (None, self.obs_dim))
+        check_finite("observation", observation, (None, self.obs_dim))
         n = len(observation)
-        _check("action_history", action_history, (n, self.max_delay, self.act_dim))
-        delay = self._trained_delay(self._delay(delay, n), action_history)
+        check_finite("action_history", action_history, (n, self.max_delay, self.act_dim))
+        delay = self._trained_delay(checked_delay(delay, n, self.max_delay).to(self.device), action_history)
         extra_states = self._extra_states(state_history, state_known, n)
         shortest, longest = int(delay.min()), int(delay.max())
         length = longest + config.horizon  # a decision costs what its age costs
@@ -232,7 +232,7 @@ class InpaintingPlanner(nn.Module):
         shape = (length, self.obs_dim + self.act_dim)
         if noise is not None:
             noise = self._tensor(noise)
-            _check("noise", noise, (n_candidates, self.window_length, shape[1]))
+            check_finite("noise", noise, (n_candidates, self.window_length, shape[1]))
             n_candidates, noise = len(noise), noise[:, :length]
         elif n_candidates is None:
             n_candidates = 1 if value_fn is None else config.n_candidates
@@ -319,42 +319,18 @@ class InpaintingPlanner(nn.Module):
         states, actions = self._split(x)
         rows = th.arange(len(x), device=x.device)
         present = states[rows, :, delay].mean(1)  # (B, obs_dim)
-        values = self._values(states, actions, present, delay, value_fn, shortest)  # (B, N)
-        return Plan(
-            choose(actions[rows, :, delay], values, self.config.choice_factor), present, states, actions, values
-        )
-
-    def _values(
-        self,
-        states: th.Tensor,
-        actions: th.Tensor,
-        present: th.Tensor,
-        delay: th.Tensor,
-        value_fn: ValueFn | None,
-        shortest: int,
-    ) -> th.Tensor:
-        """Return the mean value of each candidate's scored states: (B, N)."""
+        decisions = actions[rows, :, delay]  # (B, N, act_dim)
         if value_fn is None:
-            return th.zeros(states.shape[:2], device=self.device)
-        if self.config.scored_states == "decision":
-            rows = th.arange(len(delay), device=self.device)
-            states = present[:, None, None].expand(-1, states.shape[1], -1, -1)  # (B, N, 1, obs_dim)
-            actions = actions[rows, :, delay][:, :, None]  # windows of one step
-            skipped, first = 0, th.zeros_like(delay)
-        elif self.config.scored_states == "all":
-            skipped, first = 1, th.ones_like(delay)
+            values = th.zeros(x.shape[:2], device=x.device)
+        elif self.config.scored_states == "decision":
+            shared = present[:, None].expand(-1, x.shape[1], -1)  # (B, N, obs_dim)
+            values = value_of(value_fn, shared[:, :, None], decisions[:, :, None])[..., 0]
         else:
-            skipped, first = 1 + shortest, 1 + delay  # (B,)
-        values = value_fn(states[:, :, skipped:], actions[:, :, skipped:]).float()  # (B, N, L - skipped)
-        if values.shape != (*states.shape[:2], states.shape[2] - skipped):
-            raise ValueError(
-                f"value_fn returned the shape {tuple(values.shape)}, expected one value per state, "
-                f"{(*states.shape[:2], states.shape[2] - skipped)}: drop a last dimension of 1."
-            )
-        steps = th.arange(skipped, states.shape[2], device=self.device)
-        last = first + 1 if self.config.scored_states == "decision" else delay + self.config.horizon  # (B,)
-        scored = ((steps >= first[:, None]) & (steps < last[:, None]))[:, None]  # (B, 1, L - skipped)
-        return th.where(scored, values, 0.0).sum(-1) / scored.sum(-1)
+            first = th.ones_like(delay) if self.config.scored_states == "all" else delay + 1  # (B,)
+            skipped = 1 if self.config.scored_states == "all" else shortest + 1
+            end = delay + self.config.horizon
+            values = mean_value(value_fn, states, actions, first, end, skipped)
+        return Plan(choose(decisions, values, self.config.choice_factor), present, states, actions, values)
 
     def _within(self, delay: th.Tensor, length: int) -> th.Tensor:
         """Tell which steps a window of each delay has, d + horizon of them: (B, L) bool."""
@@ -370,21 +346,6 @@ class InpaintingPlanner(nn.Module):
 
     def _tensor(self, values: th.Tensor) -> th.Tensor:
         return th.as_tensor(values, dtype=th.float32, device=self.device)
-
-    def _delay(self, delay: th.Tensor, batch_size: int) -> th.Tensor:
-        """Return checked delays: (B,) int64 on this planner's device."""
-        delay = th.as_tensor(delay)
-        if delay.shape != (batch_size,) or delay.is_floating_point():
-            raise ValueError(
-                f"delay is {delay.dtype} of the shape {tuple(delay.shape)}, expected integers of the shape "
-                f"({batch_size},), one per decision or window."
-            )
-        if not 0 <= int(delay.min()) <= int(delay.max()) <= self.max_delay:
-            raise ValueError(
-                f"delay runs from {int(delay.min())} to {int(delay.max())}, expected 0..{self.max_delay}: build the "
-                "planner with a larger max_delay."
-            )
-        return delay.to(self.device, th.int64)
 
     def _trained_delay(self, delay: th.Tensor, action_history: th.Tensor) -> th.Tensor:
         """Return the delays to plan with: (B,) int64; with ``mask="fixed"`` D, at the start of an episode too.
@@ -415,47 +376,13 @@ class InpaintingPlanner(nn.Module):
         if state_history is None or state_known is None:  # zeros, so that a recorded graph always has these inputs
             state_history, state_known = th.zeros(*shape, self.obs_dim), th.zeros(shape)
         state_history, state_known = self._tensor(state_history), self._tensor(state_known)
-        _check("state_history", state_history, (*shape, self.obs_dim))
-        _check("state_known", state_known, shape)
+        check_finite("state_history", state_history, (*shape, self.obs_dim))
+        check_finite("state_known", state_known, shape)
         if not ((state_known == 0) | (state_known == 1)).all():
             raise ValueError("state_known has entries other than 0 and 1, expected 1 where a state is known.")
         return state_history, state_known.bool()
 
 
-def choose(actions: th.Tensor, values: th.Tensor, factor: float | None) -> th.Tensor:
-    """Return one action of N: the most valuable, or the mean weighed by exp(factor * z), z the standardised values.
-
-    Where the present is uncertain the most valuable of many is mostly a lucky one, and acting on luck is jittery.
-
-    :param actions: (B, N, act_dim)
-    :param values: (B, N)
-    :param factor: None for the most valuable
-    :return: (B, act_dim)
-    """
-    if factor is None:
-        return actions[th.arange(len(actions), device=actions.device), values.argmax(1)]
-    z = (values - values.mean(1, keepdim=True)) / values.std(1, correction=0, keepdim=True).clamp(min=1e-6)
-    return ((factor * z).softmax(1)[..., None] * actions).sum(1)
-
-
 def _owner(value_fn: ValueFn) -> object:
     """Return the object whose method a function is, or the function."""
     return getattr(value_fn, "__self__", value_fn)
-
-
-def _check_shape(name: str, values: th.Tensor, shape: tuple[int | None, ...]) -> None:
-    """Refuse a tensor of another shape; ``None`` stands for any size."""
-    if len(values.shape) != len(shape) or any(
-        want not in (None, have) for have, want in zip(values.shape, shape, strict=True)
-    ):
-        expected = ", ".join("any" if want is None else str(want) for want in shape)
-        raise ValueError(f"{name} has the shape {tuple(values.shape)}, expected ({expected}).")
-    if len(values) == 0:
-        raise ValueError(f"{name} is empty, expected at least one row.")
-
-
-def _check(name: str, values: th.Tensor, shape: tuple[int | None, ...]) -> None:
-    """Refuse a tensor of another shape or with numbers that are not finite."""
-    _check_shape(name, values, shape)
-    if not values.isfinite().all():
-        raise ValueError(f"{name} has entries that are NaN or infinite; find out where they come from first.")

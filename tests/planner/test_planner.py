@@ -26,7 +26,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_said.planner import InpaintingPlanner, precision
 from sb3_said.planner.diffusion import alpha_sigma, draw_times
-from sb3_said.planner.planner import choose
+from sb3_said.planner.selection import choose
 from sb3_said.replay.windows import Windows
 
 # --- loss ------------------------------------------------------------------------------------------------------------
