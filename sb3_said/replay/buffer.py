@@ -12,13 +12,11 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples, Repla
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_said.delays.space import EXECUTED, UNDELAYED, check_spaces
-from sb3_said.files.registry import register_class
 from sb3_said.replay.windows import Windows, WindowSource
 
-_ROW_ARRAYS = ("observations", "actions", "rewards", "dones", "timeouts", "ages", "steps", "tail_slots")
+_ROW_ARRAYS = ("observations", "actions", "rewards", "dones", "timeouts", "ages", "steps", "ends")
 
 
-@register_class
 class DelayedReplayBuffer(ReplayBuffer):
     """Replay of a delayed task, at the memory of an undelayed one.
 
@@ -83,11 +81,9 @@ class DelayedReplayBuffer(ReplayBuffer):
         self.timeouts = np.zeros(shape, np.float32)
         self.ages = np.zeros(shape, np.int16)
         self.steps = np.zeros(shape, np.int32)
-        # Tails: (state, age) that follow a row which no stored row continues. Slot -1: the next row continues.
-        self.tail_slots = np.full(shape, -1, np.int32)
-        self.tail_states: np.ndarray = np.zeros((0, state_space.shape[0]), np.float32)
-        self.tail_ages: np.ndarray = np.zeros(0, np.int16)
-        self._free_slots: list[int] = []
+        # Rows that no stored row continues, and the (state, age) that follows each: its tail
+        self.ends = np.zeros(shape, bool)
+        self.tails: dict[tuple[int, int], tuple[np.ndarray, int]] = {}
         # What follows the newest row of each environment, and the observation that would continue its episode.
         self._next_states = np.zeros((n_envs, state_space.shape[0]), np.float32)
         self._next_ages = np.zeros(n_envs, np.int16)
@@ -119,10 +115,13 @@ class DelayedReplayBuffer(ReplayBuffer):
         if self.is_delayed:
             self._check_order(obs, next_obs, continues)
         started = np.flatnonzero(~continues)
-        if self.full:
-            self._free(row)
+        for env in np.flatnonzero(self.ends[row]).tolist():  # overwritten
+            del self.tails[row, env]
+        self.ends[row] = False
         if self.size() > 0:
-            self._keep_tails(previous, started)
+            for env in started.tolist():
+                self.tails[previous, env] = self._next_states[env].copy(), int(self._next_ages[env])
+                self.ends[previous, env] = True
 
         self.observations[row] = np.where(continues[:, None], self._next_states, obs["observation"])
         self.steps[row] = np.where(continues, self.steps[previous] + 1, 0)
@@ -201,31 +200,12 @@ class DelayedReplayBuffer(ReplayBuffer):
             )
         return np.stack([info[UNDELAYED] for info in infos])
 
-    def _keep_tails(self, row: int, envs: np.ndarray) -> None:
-        for env in envs:
-            if not self._free_slots:
-                n_slots = len(self.tail_ages)
-                n_new = max(n_slots, 64)
-                new_states = np.zeros((n_new, self.tail_states.shape[1]), np.float32)
-                self.tail_states = np.concatenate([self.tail_states, new_states])
-                self.tail_ages = np.concatenate([self.tail_ages, np.zeros(n_new, np.int16)])
-                self._free_slots = list(range(n_slots + n_new - 1, n_slots - 1, -1))
-            slot = self._free_slots.pop()
-            self.tail_slots[row, env] = slot
-            self.tail_states[slot] = self._next_states[env]
-            self.tail_ages[slot] = self._next_ages[env]
-
     def reset(self) -> None:
         """Forget everything stored."""
         super().reset()
-        self.tail_slots[:] = -1
-        self.tail_states, self.tail_ages, self._free_slots = self.tail_states[:0], self.tail_ages[:0], []
+        self.ends[:] = False
+        self.tails.clear()
         self._expected = None
-
-    def _free(self, row: int) -> None:
-        slots = self.tail_slots[row]
-        self._free_slots.extend(slots[slots >= 0].tolist())
-        slots[:] = -1
 
     # ------------------------------------------------------------------------------------------------ sampling
 
@@ -291,9 +271,8 @@ class DelayedReplayBuffer(ReplayBuffer):
         """Return s_{t+1} and its observation's age: (B, obs_dim), (B,)."""
         next_rows = (rows + 1) % self.buffer_size
         states, ages = self.observations[next_rows, envs], self.ages[next_rows, envs]
-        slots = self.tail_slots[rows, envs]
-        ended = slots >= 0
-        states[ended], ages[ended] = self.tail_states[slots[ended]], self.tail_ages[slots[ended]]
+        for i in np.flatnonzero(self.ends[rows, envs]):
+            states[i], ages[i] = self.tails[int(rows[i]), int(envs[i])]
         newest = rows == (self.pos - 1) % self.buffer_size
         states[newest], ages[newest] = self._next_states[envs[newest]], self._next_ages[envs[newest]]
         return states, ages
@@ -347,7 +326,7 @@ class DelayedReplayBuffer(ReplayBuffer):
             raise ValueError("The replay buffer is empty; collect transitions before training a planner.")
         n_rows = max(int(self.size() * newest_fraction), 1)
         rows = (self.pos - n_rows + np.arange(n_rows)) % self.buffer_size  # (T,), oldest first
-        ends = self.tail_slots[rows] >= 0  # (T, n_envs)
+        ends = self.ends[rows]  # (T, n_envs), a copy
         ends[-1] = True
         last = np.where(ends, np.arange(n_rows)[:, None], n_rows)
         last = np.minimum.accumulate(last[::-1], axis=0)[::-1]  # (T, n_envs): where each episode ends
@@ -389,12 +368,12 @@ class DelayedReplayBuffer(ReplayBuffer):
         return {
             "pos": self.pos,
             "full": self.full,
-            "free_slots": np.array(self._free_slots, np.int64),
             "expected": self._expected,
             "next_states": self._next_states,
             "next_ages": self._next_ages,
-            "tail_states": self.tail_states,
-            "tail_ages": self.tail_ages,
+            "tail_places": np.array([*self.tails], np.int64).reshape(-1, 2),
+            "tail_states": np.array([state for state, _ in self.tails.values()], np.float32),
+            "tail_ages": np.array([age for _, age in self.tails.values()], np.int16),
             **{name: getattr(self, name)[: self.size()] for name in _ROW_ARRAYS},
         }
 
@@ -412,13 +391,15 @@ class DelayedReplayBuffer(ReplayBuffer):
                 f"{self.observations.shape}; use the buffer_size, n_envs, task and max_delay it was made with."
             )
         self.pos, self.full = state["pos"], state["full"]
-        self._free_slots = state["free_slots"].tolist()
         self._expected = state["expected"]
         self._next_states, self._next_ages = state["next_states"].copy(), state["next_ages"].copy()
-        self.tail_states, self.tail_ages = state["tail_states"].copy(), state["tail_ages"].copy()
+        places = map(tuple, state["tail_places"].tolist())
+        self.tails = dict(
+            zip(places, zip(state["tail_states"].copy(), state["tail_ages"].tolist(), strict=True), strict=True)
+        )
         for name in _ROW_ARRAYS:
             getattr(self, name)[:size] = state[name]
-        self.tail_slots[size:] = -1  # of whatever was stored before
+        self.ends[size:] = False  # of whatever was stored before
 
     def _fits(self, expected: dict[str, np.ndarray] | None) -> bool:
         """Tell whether the observation that would continue a stored replay is of this buffer's task."""
