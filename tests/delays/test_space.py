@@ -19,9 +19,9 @@ from sb3_said.delays.space import ages_of, check_spaces, has_state_history, writ
         (spaces.Box(-1, 1, (3, 3)), spaces.Box(-1, 1, (2,)), "FlattenObservation"),
         (spaces.Discrete(3), spaces.Box(-1, 1, (2,)), "FlattenObservation"),
         (spaces.Dict(observation=spaces.Box(-1, 1, (3,))), spaces.Box(-1, 1, (2,)), "wrap the task"),
-        (spaces.Box(-1, 1, (3,)), spaces.Discrete(2), "RescaleAction"),
-        (spaces.Box(-1, 1, (3,)), spaces.Box(-1, np.inf, (2,)), "RescaleAction"),
-        (spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (2, 2)), "RescaleAction"),
+        (spaces.Box(-1, 1, (3,)), spaces.Discrete(2), "1-D Box action with finite bounds"),
+        (spaces.Box(-1, 1, (3,)), spaces.Box(-1, np.inf, (2,)), "1-D Box action with finite bounds"),
+        (spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (2, 2)), "1-D Box action with finite bounds"),
     ],
 )
 def test_other_spaces_are_refused_with_a_reason(observation_space, action_space, reason):
