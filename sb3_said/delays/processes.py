@@ -103,12 +103,7 @@ class EpisodeDelay(_Range):
 
 @dataclass(frozen=True)
 class UniformDelay(_Range):
-    """A delay drawn uniformly from ``low..high`` (both included) for every packet.
-
-    :param low: smallest delay, in control steps, >= 0
-    :param high: largest delay, in control steps, >= low
-    :raises ValueError: for a negative, fractional or empty range
-    """
+    """A delay drawn uniformly from ``low..high`` (both included) for every packet; else as :class:`EpisodeDelay`."""
 
     def sample(self, rng: np.random.Generator) -> Iterator[int]:
         while True:
@@ -174,10 +169,10 @@ WIFI_20MS = DistributionDelay((0.0, 0.3082, 0.5927, 0.0829, 0.0075, 0.0031, 0.00
 class RandomWalkDelay(_Range):
     """A delay that drifts: one step up or down with probability ``move_prob``, starting anywhere in ``low..high``.
 
-    A move out of the range is not made, so that all delays are equally frequent in the long run.
+    It stays where a move would leave the range, so that all delays are equally frequent in the long run.
 
-    :param low: smallest delay, in control steps, >= 0
-    :param high: largest delay, in control steps, >= low
+    :param low: as of :class:`EpisodeDelay`
+    :param high: as of :class:`EpisodeDelay`
     :param move_prob: probability that the delay moves between one packet and the next, half of it upwards
     :raises ValueError: for a negative, fractional or empty range, or a probability outside 0..1
     """

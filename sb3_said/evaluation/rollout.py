@@ -165,8 +165,8 @@ def measure_latency(
 ) -> Latency:
     """Time single decisions, from a NumPy observation to a NumPy action, as a control loop asks for them.
 
-    First call ``model.warmup()``, or ``predict`` once where a model has no ``warmup``. Every call after that counts,
-    slow ones included. Each call gets the state that the last one returned.
+    ``model.warmup()`` runs first, or one call of ``predict`` where a model has no ``warmup``. Every call after that
+    counts, slow ones included, and gets the state that the call before it returned.
 
     :param model: anything with the ``predict`` of Stable-Baselines3
     :param observations: (M, ...), or a dict of such arrays; call i gets observation i mod M

@@ -89,7 +89,7 @@ class Summary:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what ``json.dump`` takes; NaN becomes None, since JSON has no NaN."""
+        """Return the row in JSON types; NaN becomes None, since JSON has no NaN."""
         return {key: _without_nan(value) for key, value in asdict(self).items()}
 
 
