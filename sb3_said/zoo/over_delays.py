@@ -20,7 +20,7 @@ import numpy as np
 import torch as th
 
 from sb3_said.delays import FixedDelay
-from sb3_said.delays.processes import make_process
+from sb3_said.delays.text import make_process
 from sb3_said.evaluation import Summary, bootstrap_interval, plots, rollout
 from sb3_said.files.atomic import write_json
 from sb3_said.zoo.manager import Delay, largest_delay, read_delay
