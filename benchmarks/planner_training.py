@@ -39,6 +39,8 @@ def make_source(n_episodes: int = 50, length: int = 400) -> WindowSource:
     return WindowSource(
         states=th.randn(n, 1, OBS_DIM, generator=generator),
         actions=th.rand(n, 1, ACT_DIM, generator=generator) * 2 - 1,
+        rewards=th.zeros(n, 1),
+        terminated=th.zeros(n, 1, dtype=th.bool),
         rows=th.arange(n),
         envs=th.zeros(n, dtype=th.int64),
         remaining=length - step,
