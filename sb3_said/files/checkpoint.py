@@ -13,12 +13,10 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_said.files.agents import load_tree, save_tree
-from sb3_said.replay.buffer import DelayedReplayBuffer
+from sb3_said.files.agents import SafeSaveMixin, agent_state, restore_agent
+from sb3_said.files.archive import SavedFileError, load_tree, readable, save_tree
 
 CHECKPOINT_NAME = "checkpoint.zip"
-_COUNTERS = ("num_timesteps", "_episode_num", "_n_updates", "_total_timesteps", "_current_progress_remaining")
-_OPTIONAL_COUNTERS = ("_planner_trained_at",)  # SAID's
 
 
 class TrainingCheckpointCallback(BaseCallback):
@@ -54,35 +52,28 @@ class TrainingCheckpointCallback(BaseCallback):
 
     def save(self) -> None:
         """Write a checkpoint now."""
-        assert isinstance(self.model, OffPolicyAlgorithm)
+        assert isinstance(self.model, SafeSaveMixin)
         save_tree(self.path, training_state(self.model, self.locals.get("callback")))
         self._saved_at = self.model.num_timesteps
 
 
-def training_state(model: OffPolicyAlgorithm, callback: BaseCallback | None = None) -> dict[str, Any]:
+def training_state(model: SafeSaveMixin, callback: BaseCallback | None = None) -> dict[str, Any]:
     """Return the state of a run as nested dicts of tensors, arrays and numbers.
 
-    :param model: with a ``DelayedReplayBuffer``
+    :param model: with a replay buffer that has a ``state_dict``
     :param callback: whose ``EvalCallback`` evaluations are kept too
     """
-    replay_buffer = _replay_buffer(model)
-    variables = model._get_torch_save_params()[1]
     vec_normalize = model.get_vec_normalize_env()
     return {
-        "parameters": model.get_parameters(),
-        "variables": {name: getattr(model, name).detach() for name in variables},
-        "counters": {
-            **{name: getattr(model, name) for name in _COUNTERS},
-            **{name: getattr(model, name) for name in _OPTIONAL_COUNTERS if hasattr(model, name)},
-        },
-        "replay_buffer": replay_buffer.state_dict(),
+        **agent_state(model),
+        "replay_buffer": _replay_buffer(model).state_dict(),
         "vec_normalize": None if vec_normalize is None else _vec_normalize_state(vec_normalize),
         "evaluations": [_evaluation_state(e) for e in _eval_callbacks(callback)],
         "random": random_state(),
     }
 
 
-def restore_training(model: OffPolicyAlgorithm, path: str | Path, callback: BaseCallback | None = None) -> None:
+def restore_training(model: SafeSaveMixin, path: str | Path, callback: BaseCallback | None = None) -> None:
     """Bring a newly made model to where a checkpoint was written. Its environment starts a new episode.
 
     The environment is seeded from the run's seed and the step reached, so two resumes from one checkpoint are the same
@@ -106,14 +97,8 @@ def restore_training(model: OffPolicyAlgorithm, path: str | Path, callback: Base
             f"The run of {path} was {'not ' if vec_normalize else ''}normalised by VecNormalize, and this model's "
             f"environment is{'' if vec_normalize else ' not'}; resume with the environment of the run."
         )
-    try:
-        model.set_parameters(state["parameters"], exact_match=True, device=model.device)
-    except (RuntimeError, AttributeError) as error:
-        raise ValueError(f"{path} is of a model with other networks or optimizers: {error}") from error
-    for name, value in state["variables"].items():
-        getattr(model, name).data.copy_(value)
-    for name, value in state["counters"].items():
-        setattr(model, name, value)
+    with readable(path):
+        restore_agent(model, state)
     replay_buffer.load_state_dict(state["replay_buffer"])
     if vec_normalize is not None:
         _restore_vec_normalize(vec_normalize, state["vec_normalize"])
@@ -124,7 +109,8 @@ def restore_training(model: OffPolicyAlgorithm, path: str | Path, callback: Base
         seed = _seed_of_resume(model.seed, model.num_timesteps)
         model.env.seed(seed)
         model.action_space.seed(seed)
-    restore_random_state(state["random"])
+    with readable(path):
+        restore_random_state(state["random"])
 
 
 def _seed_of_resume(seed: int, steps: int) -> int:
@@ -142,19 +128,26 @@ def random_state() -> dict[str, Any]:
 
 
 def restore_random_state(state: dict[str, Any]) -> None:
-    """Restore what ``random_state`` returned."""
+    """Restore what ``random_state`` returned.
+
+    :raises SavedFileError: for a position that NumPy's generator never has, which would crash the process
+    """
     version, internal, gauss = state["python"]
+    name, keys, position, *rest = state["numpy"]
+    if name != "MT19937" or type(position) is not int or not 0 <= position <= 624:
+        raise SavedFileError(f"NumPy's random state is {name} at position {position}, expected MT19937 at 0..624")
     random.setstate((version, tuple(internal), gauss))
-    np.random.set_state(tuple(state["numpy"]))
+    np.random.set_state((name, keys, position, *rest))
     th.set_rng_state(state["torch"])
     if "cuda" in state and th.cuda.is_available():
         th.cuda.set_rng_state_all(state["cuda"])
 
 
-def _replay_buffer(model: OffPolicyAlgorithm) -> DelayedReplayBuffer:
-    if not isinstance(model.replay_buffer, DelayedReplayBuffer):
+def _replay_buffer(model: OffPolicyAlgorithm) -> Any:
+    if not hasattr(model.replay_buffer, "load_state_dict"):
+        name = type(model.replay_buffer).__name__
         raise ValueError(
-            f"Checkpoints are of agents with a DelayedReplayBuffer, got {type(model.replay_buffer).__name__}."
+            f"Checkpoints need a replay buffer with a state_dict, such as DelayedReplayBuffer, got {name}."
         )
     return model.replay_buffer
 

@@ -13,14 +13,12 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples, Repla
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_said.delays.space import EXECUTED, UNDELAYED, check_spaces
-from sb3_said.files.registry import register_class
 from sb3_said.planner.values import average_reward_tail, discounted_values, normalise_values
 from sb3_said.replay.windows import Windows, WindowSource
 
 _ROW_ARRAYS = ("observations", "actions", "rewards", "dones", "timeouts", "ages", "steps", "tail_slots")
 
 
-@register_class
 class DelayedReplayBuffer(ReplayBuffer):
     """Replay of a delayed task, at the memory of an undelayed one.
 

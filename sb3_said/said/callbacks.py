@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from stable_baselines3.common.callbacks import BaseCallback
 from tqdm.auto import tqdm
 
-from sb3_said.files.agents import load_tree, save_tree
+from sb3_said.files.archive import load_tree, save_tree
 from sb3_said.planner.trainer import worse_than_regression
 
 if TYPE_CHECKING:

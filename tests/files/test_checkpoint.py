@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.files import checkpoint
-from sb3_said.files.agents import load_tree, save_tree
+from sb3_said.files.archive import load_tree, save_tree
 from sb3_said.files.checkpoint import (
     CHECKPOINT_NAME,
     TrainingCheckpointCallback,

@@ -12,7 +12,7 @@ from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import KVWriter, Logger
 
 from sb3_said import SAID, DelayedObservationWrapper, PlannerTrainingCallback
-from sb3_said.files.agents import load_tree, save_tree
+from sb3_said.files.archive import load_tree, save_tree
 from sb3_said.files.checkpoint import TrainingCheckpointCallback, restore_training
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.said.callbacks import PLANNER_CHECKPOINT_NAME
