@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import inspect
 import os
 import pathlib
 import warnings
-from collections.abc import Iterator
+from collections.abc import Collection
 from typing import Any, ClassVar, TypeVar
 
 import torch as th
@@ -23,26 +22,24 @@ from sb3_said.files.arguments import as_data, from_data, space_as_data, space_fr
 
 SelfSafeSave = TypeVar("SelfSafeSave", bound="SafeSaveMixin")
 SelfSafePolicy = TypeVar("SelfSafePolicy", bound="SafePolicyMixin")
+_COUNTERS = ("num_timesteps", "_total_timesteps", "_episode_num", "_n_updates", "_current_progress_remaining")  # SB3's
+_NO_ARGUMENTS = {"self", "policy", "env", "device", "tensorboard_log", "_init_setup_model"}  # of an agent's in a file
 
 
 class SafeSaveMixin(OffPolicyAlgorithm):
     """Makes an SB3 off-policy algorithm save to and load from files without pickle. Name it before the algorithm.
 
-    Every argument of the constructor after ``policy, env`` must be an attribute of the same name.
+    Every argument of the constructor after ``policy, env`` must be an attribute of the same name. A subclass adds what
+    it counts to ``counters``, and to ``own_classes`` the classes that its constructor takes where none are given.
     """
 
-    # What an algorithm counts, and the classes that its constructor takes where none is given; a subclass adds its own.
-    counters: ClassVar[tuple[str, ...]] = (
-        *("num_timesteps", "_total_timesteps", "_episode_num", "_n_updates"),
-        "_current_progress_remaining",
-    )
-    own_classes: ClassVar[dict[str, type]] = {}
+    counters: ClassVar[tuple[str, ...]] = _COUNTERS
+    own_classes: ClassVar[tuple[type, ...]] = ()
 
     def save(self, path: PathOrFile) -> None:  # type: ignore[override]
         """Write the agent to a file, without its environment and replay buffer.
 
-        A constructor argument that cannot be written without pickle, such as a function, is named in a warning and in
-        the file.
+        A constructor argument that cannot be written without pickle is named in a warning and in the file.
 
         :param path: where to write; without a suffix, ``.zip`` is added. Or a binary file object.
         :raises ValueError: for spaces other than Box and Dict of Box
@@ -50,16 +47,14 @@ class SafeSaveMixin(OffPolicyAlgorithm):
         arguments, missing = {}, {}
         for name in sorted(self._argument_names()):
             value = getattr(self, {"stats_window_size": "_stats_window_size"}.get(name, name))
-            if value is not self._own_classes().get(name):
+            if not any(value is own for own in (self.policy_aliases["MlpPolicy"], *self.own_classes)):
                 try:
                     arguments[name] = as_data(value, name)
                 except ValueError as error:
                     missing[name] = str(error)
         if missing:
             warnings.warn(
-                "Arguments that are not in the saved file, because functions and objects of unknown classes cannot be"
-                f" written without pickle: {'; '.join(missing.values())}. {_to_supply(missing)}",
-                stacklevel=2,
+                f"The saved file lacks arguments: {' '.join(missing.values())} {_advice(missing)}", stacklevel=2
             )
         tree = {
             "class": type(self).__name__,
@@ -102,48 +97,43 @@ class SafeSaveMixin(OffPolicyAlgorithm):
             get_system_info()
             print("== SAVED MODEL SYSTEM INFO ==", load_metadata(path)["versions"], sep="\n")
         names = cls._argument_names()
-        if unknown := sorted(kwargs.keys() - names - {"tensorboard_log"}):
-            raise ValueError(f"{cls.__name__} has no argument {', '.join(unknown)}; it has {', '.join(sorted(names))}.")
         given = {name: value for name, value in (custom_objects or {}).items() if name in names}
         saved = load_tree(path, "agent")
         with readable(path):
             _check_class(saved["class"], cls)
-            _check_names("arguments", [*saved["arguments"], *saved["missing"]], names, exact=False)
+            _check_names("arguments", saved["arguments"], names, exact=False)
             arguments = {n: from_data(node) for n, node in saved["arguments"].items() if n not in given} | given
             observation_space, action_space = map(space_from_data, saved["spaces"])
-        if absent := [name for name in saved["missing"] if name not in given | kwargs]:
-            warnings.warn(
-                f"The file lacks {', '.join(absent)}, which could not be written without pickle: the defaults of"
-                f" {cls.__name__} are used. {_to_supply(absent)}",
-                stacklevel=2,
-            )
+            if absent := [name for name in saved["missing"] if name not in given | kwargs]:
+                warnings.warn(
+                    f"The file lacks {', '.join(absent)}: {cls.__name__} takes its defaults. {_advice(absent)}",
+                    stacklevel=2,
+                )
         stored = arguments.get("policy_kwargs")
         if stored is not None and kwargs.get("policy_kwargs", stored) != stored:
             raise ValueError(
                 f"The given policy_kwargs {kwargs['policy_kwargs']} differ from {stored} in the file, which the saved"
                 " networks were built with. Leave them out of the call."
             )
-        arguments |= kwargs
-        policy = arguments.pop("policy_class", cls._own_classes()["policy_class"])
-        with _building(cls, path):
+        policy = (arguments := arguments | kwargs).pop("policy_class", cls.policy_aliases["MlpPolicy"])
+        with readable(path, passing=(ValueError,)):
             if env is not None:
                 env = cls._wrap_env(env, arguments.get("verbose", 0))
                 cls._check_spaces(env, observation_space, action_space)
-            model = cls(policy, env, device=device, _init_setup_model=False, **arguments)  # type: ignore[call-arg, arg-type]
+            arguments |= {"device": device, "_init_setup_model": False}
+            model = cls(policy, env, **arguments)  # type: ignore[arg-type]
+            _restore_counters(model, saved["counters"])
             if env is None:
                 model.observation_space, model.action_space = observation_space, action_space
                 model.n_envs = saved["n_envs"]
-            with readable(path):
-                _restore_counters(model, saved["counters"])
             model._setup_model()
-        with readable(path):
             restore_agent(model, saved)
         if model.use_sde:  # its noise was drawn before the parameters were there
             model.policy.reset_noise()  # type: ignore[operator]
         model._check_loaded()
         return model
 
-    def set_parameters(  # type: ignore[override]
+    def set_parameters(
         self,
         load_path_or_dict: PathOrFile | dict[str, Any],
         exact_match: bool = True,
@@ -166,17 +156,13 @@ class SafeSaveMixin(OffPolicyAlgorithm):
 
     @classmethod
     def _argument_names(cls) -> set[str]:
-        """Return the names of the constructor's arguments that a file holds, with those of its base classes."""
+        """Return the names of the arguments that a file holds: those of the constructors up to SB3's algorithm."""
         names = {"policy_class"}
         for base in cls.__mro__[: cls.__mro__.index(OffPolicyAlgorithm)]:
-            if "__init__" in vars(base):  # else it would be SB3's own, whose arguments SAC gives
-                parameters = inspect.signature(base.__init__).parameters.values()  # type: ignore[misc]
-                names |= {p.name for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
-        return names - {"self", "policy", "env", "device", "tensorboard_log", "_init_setup_model"}
-
-    @classmethod
-    def _own_classes(cls) -> dict[str, type]:
-        return {"policy_class": cls.policy_aliases["MlpPolicy"], **cls.own_classes}
+            if "__init__" in vars(base):
+                parameters = inspect.signature(base).parameters.values()
+                names |= {p.name for p in parameters if p.kind is not p.VAR_KEYWORD}
+        return names - _NO_ARGUMENTS
 
     @classmethod
     def _check_spaces(cls, env: GymEnv, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
@@ -198,20 +184,13 @@ class SafePolicyMixin(BasePolicy):
         """Write networks and constructor arguments, all that ``predict`` needs; optimizers are the algorithm's.
 
         :param path: where to write, as it is. Or a binary file object.
-        :raises ValueError: if a constructor argument is a function or an object of an unknown class
+        :raises ValueError: if a constructor argument cannot be written without pickle
         """
         arguments = self._get_constructor_parameters()
-        arguments.pop("lr_schedule", None)  # the algorithm's
+        arguments.pop("lr_schedule")  # the algorithm's
         own_spaces = [space_as_data(arguments.pop(name)) for name in ("observation_space", "action_space")]
-        try:
-            data = as_data(arguments, "arguments")
-        except ValueError as error:
-            raise ValueError(
-                f"Cannot save this {type(self).__name__}: {error}, and functions and objects of unknown classes cannot"
-                " be written without pickle."
-            ) from error
-        tree = {"class": type(self).__name__, "arguments": data, "spaces": own_spaces, "state_dict": self.state_dict()}
-        save_tree(path, tree, {"policy": type(self).__name__}, "policy")
+        tree = {"class": type(self).__name__, "arguments": as_data(arguments, "arguments"), "spaces": own_spaces}
+        save_tree(path, tree | {"state_dict": self.state_dict()}, {"policy": type(self).__name__}, "policy")
 
     @classmethod
     def load(cls: type[SelfSafePolicy], path: PathOrFile, device: th.device | str = "auto") -> SelfSafePolicy:
@@ -225,10 +204,7 @@ class SafePolicyMixin(BasePolicy):
         with readable(path):
             _check_class(saved["class"], cls)
             arguments = from_data(saved["arguments"])
-            own_spaces = map(space_from_data, saved["spaces"])
-        with _building(cls, path):
-            policy = cls(*own_spaces, ConstantSchedule(0.0), **arguments)
-        with readable(path):
+            policy = cls(*map(space_from_data, saved["spaces"]), ConstantSchedule(0.0), **arguments)
             _check_tensors("state_dict", saved["state_dict"], policy.state_dict())
             policy.load_state_dict(saved["state_dict"])
         policy.to(get_device(device))
@@ -238,10 +214,7 @@ class SafePolicyMixin(BasePolicy):
 
 
 def agent_state(model: SafeSaveMixin) -> dict[str, Any]:
-    """Return what learning has changed, as a tree: counters, parameters and the entropy coefficient.
-
-    Of optimizers only the state is kept: their settings are the constructor's.
-    """
+    """Return what learning has changed, as a tree; of optimizers only the state, as their settings are arguments."""
     parameters = model.get_parameters()
     return {
         "counters": {name: getattr(model, name) for name in model.counters},
@@ -269,54 +242,50 @@ def _restore_counters(model: SafeSaveMixin, saved: dict[str, Any]) -> None:
         value, own = saved[name], getattr(model, name)
         is_list = type(value) is list and all(type(item) is int for item in value)
         if type(value) is not type(own) if isinstance(own, (int, float)) else not (value is None or is_list):
-            raise SavedFileError(f"its {name} is {value!r:.100}")
+            raise SavedFileError(f"its {name} is {value!r:.50}")
         setattr(model, name, value)
 
 
 def _restore_parameters(model: SafeSaveMixin, saved: dict[str, Any], exact: bool = True) -> None:
-    saved = model._adapt_parameters(saved)
-    own = model.get_parameters()
-    _check_names(f"parameters (of this {type(model).__name__})", saved, own, exact)
+    saved, own = model._adapt_parameters(saved), model.get_parameters()
+    _check_names("parameters", saved, own, exact)
     for name, state in saved.items():
         target = recursive_getattr(model, name)
         if isinstance(target, th.optim.Optimizer):
-            _check_optimizer(name, state, target)
+            owners = dict(enumerate(p for group in target.param_groups for p in group["params"]))
+            _check_names(name, state, owners, exact=False)
+            for index, values in state.items():
+                _check_optimizer_state(f"{name}[{index}]", values, owners[index].shape)
             target.load_state_dict({**own[name], "state": state})
         else:
             _check_tensors(name, state, own[name], exact)
             target.load_state_dict(state, strict=exact)
 
 
+def _check_optimizer_state(where: str, state: dict[str, Any], shape: th.Size) -> None:
+    for name, value in state.items():  # as large as its parameter or, as the step, a number for all of it
+        fits = isinstance(value, (int, float, type(None)))
+        if isinstance(value, th.Tensor):
+            fits = th.broadcast_shapes(value.shape, shape) == shape and bool(th.isfinite(value).all())
+        if not fits:
+            raise SavedFileError(f"its {name} of {where} does not fit {tuple(shape)} or is not finite")
+
+
 def _check_tensors(where: str, saved: dict[str, Any], own: dict[str, Any], exact: bool = True) -> None:
     _check_names(where, saved, own, exact)
     for name, value in saved.items():
-        expected = own[name]
-        if not isinstance(value, th.Tensor) or (value.shape, value.dtype) != (expected.shape, expected.dtype):
-            given = f"{value.dtype} {tuple(value.shape)}" if isinstance(value, th.Tensor) else f"{value!r:.50}"
-            raise SavedFileError(
-                f"its {where} do not fit: {name} is {given}, expected {expected.dtype} {tuple(expected.shape)}"
-            )
+        shape, dtype = own[name].shape, own[name].dtype
+        if not isinstance(value, th.Tensor) or (value.shape, value.dtype) != (shape, dtype):
+            given = (value.dtype, tuple(value.shape)) if isinstance(value, th.Tensor) else value
+            raise SavedFileError(f"its {where} does not fit: {name} is {given!s:.60}, expected {dtype, tuple(shape)}")
         if not th.isfinite(value).all():
-            raise SavedFileError(f"its {where} have NaN or infinite entries in {name}")
+            raise SavedFileError(f"its {where} has NaN or infinite entries in {name}")
 
 
-def _check_optimizer(where: str, saved: dict[int, Any], optimizer: th.optim.Optimizer) -> None:
-    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-    for index, state in saved.items():
-        _check_names(where, [index], range(len(parameters)), exact=False)
-        for name, value in state.items():
-            if isinstance(value, th.Tensor):  # as large as its parameter or, as a step, a number for all of it
-                shape = parameters[index].shape
-                if th.broadcast_shapes(value.shape, shape) != shape or not th.isfinite(value).all():
-                    raise SavedFileError(f"its {where} does not fit: {name} of parameter {index}")
-            elif not isinstance(value, (int, float, type(None))):
-                raise SavedFileError(f"its {where} does not fit: {name} is {value!r:.50}")
-
-
-def _check_names(where: str, saved: Any, own: Any, exact: bool = True) -> None:
+def _check_names(where: str, saved: Collection[Any], own: Collection[Any], exact: bool = True) -> None:
     lacking, unknown = [x for x in own if x not in saved], [x for x in saved if x not in own]
     if unknown or (exact and lacking):
-        raise SavedFileError(f"its {where} do not fit: it lacks {lacking[:5]} and has unknown {unknown[:5]}")
+        raise SavedFileError(f"its {where} does not fit: it lacks {lacking[:5]} and has unknown {unknown[:5]}")
 
 
 def _check_class(name: str, cls: type) -> None:
@@ -324,27 +293,14 @@ def _check_class(name: str, cls: type) -> None:
         raise SavedFileError(f"it holds a {name}, where {cls.__name__} was expected: load it with {name}.load")
 
 
-@contextlib.contextmanager
-def _building(cls: type, path: PathOrFile) -> Iterator[None]:
-    """Let refusals of the constructor pass, and turn what forged arguments lead to into one error."""
-    try:
-        yield
-    except (ValueError, MemoryError, OSError):
-        raise
-    except Exception as error:
-        raise SavedFileError(
-            f"Cannot load {path}: no {cls.__name__} can be built of its arguments ({type(error).__name__}: {error})."
-        ) from error
-
-
 def _existing(path: PathOrFile) -> PathOrFile:
     """Add ``.zip`` where the path alone is no file, as SB3 does."""
-    if not isinstance(path, (str, os.PathLike)) or os.path.isfile(path):
-        return path
-    if os.path.isfile(f"{os.fspath(path)}.zip"):
-        return f"{os.fspath(path)}.zip"
-    raise FileNotFoundError(f"There is no file '{os.fspath(path)}' and no '{os.fspath(path)}.zip'.")
+    if isinstance(path, (str, os.PathLike)) and not os.path.isfile(path):
+        path = f"{os.fspath(path)}.zip"
+        if not os.path.isfile(path):
+            raise FileNotFoundError(f"There is no file '{path[:-4]}' and no '{path}'.")
+    return path
 
 
-def _to_supply(names: Any) -> str:
+def _advice(names: Collection[str]) -> str:
     return f"To supply them, use load(..., custom_objects={{{', '.join(f'{name!r}: ...' for name in names)}}})."

@@ -24,7 +24,6 @@ from sb3_said.files.atomic import PathOrFile, replacing
 
 FORMAT = 2
 
-_DESCRIPTION = ("format", "kind", "versions", "metadata")
 _MAX_HEADER = 1024  # bytes that describe an array of numbers; a longer text could exhaust NumPy's parser
 
 
@@ -52,10 +51,6 @@ def save_tree(path: PathOrFile, tree: Any, metadata: dict[str, Any] | None = Non
     """
     arrays: list[np.ndarray] = []
     description = {"format": FORMAT, "kind": kind, "versions": _versions(), "metadata": metadata or {}}
-    try:
-        json.dumps(description)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"metadata must be JSON: dict, list, str, numbers, bool or None. {error}.") from error
     document = json.dumps({**description, "tree": _encode(tree, "tree", arrays)})
     with replacing(path) as file, zipfile.ZipFile(file, "w") as archive:
         archive.writestr(zipfile.ZipInfo("tree.json"), document)  # ZipInfo without a date: equal data, equal bytes
@@ -93,21 +88,25 @@ def load_metadata(path: PathOrFile) -> dict[str, Any]:
     :raises SavedFileError: as :func:`load_tree`
     """
     with readable(path), _opened(path) as archive:
-        document = _document(archive)
-        return {name: document[name] for name in _DESCRIPTION}
+        return {name: value for name, value in _document(archive).items() if name != "tree"}
 
 
 @contextlib.contextmanager
-def readable(source: PathOrFile) -> Iterator[None]:
-    """Turn whatever goes wrong while reading a damaged or forged file into one error that names the file."""
+def readable(source: PathOrFile, passing: tuple[type[Exception], ...] = ()) -> Iterator[None]:
+    """Turn whatever goes wrong while reading a damaged or forged file into one error that names the file.
+
+    :param passing: errors to leave as they are
+    """
     name = f"'{os.fspath(source)}'" if isinstance(source, (str, os.PathLike)) else "the file object"
     try:
         yield
     except SavedFileError as error:
         raise SavedFileError(f"Cannot load {name}: {error}.") from error
     except Exception as error:
-        if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.filename is not None):
-            raise  # not the file's fault; opening it says itself that it is not there, or not permitted
+        if isinstance(error, (MemoryError, Warning, *passing)) or (
+            isinstance(error, OSError) and error.filename is not None
+        ):
+            raise  # an OSError with a name is from opening the file, and says so
         raise SavedFileError(
             f"Cannot load {name}: the file is damaged, incomplete, or was not written by sb3_said"
             f" ({type(error).__name__}: {error}). Get or save the file again."

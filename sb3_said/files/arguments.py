@@ -60,7 +60,7 @@ def as_data(value: Any, where: str) -> Any:
         return {"@": [cls.__name__, *(as_data(part, where) for part in _PARTS[cls](value))]}
     if isinstance(value, type) and value in _NAMES:
         return {"@": [_NAMES[value]]}
-    raise ValueError(f"{where} is {value!r:.100}")
+    raise ValueError(f"{where} is {value!r:.100}, which cannot be written without pickle.")
 
 
 def from_data(node: Any) -> Any:

@@ -17,6 +17,7 @@ from sb3_said.files.agents import SafeSaveMixin, agent_state, restore_agent
 from sb3_said.files.archive import SavedFileError, load_tree, readable, save_tree
 
 CHECKPOINT_NAME = "checkpoint.zip"
+_EVALUATION = ("n_calls", "best_mean_reward", "evaluations_timesteps", "evaluations_results", "evaluations_length")
 
 
 class TrainingCheckpointCallback(BaseCallback):
@@ -63,12 +64,15 @@ def training_state(model: SafeSaveMixin, callback: BaseCallback | None = None) -
     :param model: with a replay buffer that has a ``state_dict``
     :param callback: whose ``EvalCallback`` evaluations are kept too
     """
-    vec_normalize = model.get_vec_normalize_env()
+    statistics = _statistics(model.get_vec_normalize_env())
     return {
         **agent_state(model),
         "replay_buffer": _replay_buffer(model).state_dict(),
-        "vec_normalize": None if vec_normalize is None else _vec_normalize_state(vec_normalize),
-        "evaluations": [_evaluation_state(e) for e in _eval_callbacks(callback)],
+        "vec_normalize": {name: [rms.mean, rms.var, rms.count] for name, rms in statistics.items()},
+        "evaluations": [
+            {name: np.array(getattr(evaluation, name)).tolist() for name in _EVALUATION}
+            for evaluation in _eval_callbacks(callback)
+        ],
         "random": random_state(),
     }
 
@@ -85,37 +89,34 @@ def restore_training(model: SafeSaveMixin, path: str | Path, callback: BaseCallb
     :raises ValueError: when the checkpoint does not fit the model
     """
     replay_buffer, eval_callbacks = _replay_buffer(model), _eval_callbacks(callback)
+    statistics = _statistics(model.get_vec_normalize_env())
     state = load_tree(path)
     if len(eval_callbacks) != len(state["evaluations"]):
         raise ValueError(
             f"The run of {path} had {len(state['evaluations'])} EvalCallback and is resumed with "
             f"{len(eval_callbacks)}; resume with the callbacks of the run."
         )
-    vec_normalize = model.get_vec_normalize_env()
-    if (vec_normalize is None) != (state["vec_normalize"] is None):
+    if statistics.keys() != state["vec_normalize"].keys():
         raise ValueError(
-            f"The run of {path} was {'not ' if vec_normalize else ''}normalised by VecNormalize, and this model's "
-            f"environment is{'' if vec_normalize else ' not'}; resume with the environment of the run."
+            f"In the run of {path} VecNormalize normalised {', '.join(state['vec_normalize']) or 'nothing'}, in this "
+            f"model's environment {', '.join(statistics) or 'nothing'}; resume with the environment of the run."
         )
-    with readable(path):
+    with readable(path, passing=(ValueError,)):
         restore_agent(model, state)
-    replay_buffer.load_state_dict(state["replay_buffer"])
-    if vec_normalize is not None:
-        _restore_vec_normalize(vec_normalize, state["vec_normalize"])
-    for eval_callback, kept in zip(eval_callbacks, state["evaluations"], strict=True):
-        _restore_evaluations(eval_callback, kept)
+        replay_buffer.load_state_dict(state["replay_buffer"])
+        for name, rms in statistics.items():
+            rms.mean, rms.var, rms.count = state["vec_normalize"][name]
+        for eval_callback, kept in zip(eval_callbacks, state["evaluations"], strict=True):
+            for name in _EVALUATION:
+                setattr(eval_callback, name, kept[name])
+        restore_random_state(state["random"])
     model._last_obs = None  # the replay's newest episode is not the environment's, even where it looks so
     if model.seed is not None and model.env is not None:
-        seed = _seed_of_resume(model.seed, model.num_timesteps)
+        # A seed that no other use has: large, where those of runs, evaluation and tuning are small numbers.
+        drawn = np.random.SeedSequence([model.seed, model.num_timesteps]).generate_state(1)[0]
+        seed = 2**30 + int(drawn) % 2**30
         model.env.seed(seed)
         model.action_space.seed(seed)
-    with readable(path):
-        restore_random_state(state["random"])
-
-
-def _seed_of_resume(seed: int, steps: int) -> int:
-    """Return a seed that no other use has: large, where those of runs, evaluation and tuning are small numbers."""
-    return 2**30 + int(np.random.SeedSequence([seed, steps]).generate_state(1)[0]) % 2**30
 
 
 def random_state() -> dict[str, Any]:
@@ -152,41 +153,17 @@ def _replay_buffer(model: OffPolicyAlgorithm) -> Any:
     return model.replay_buffer
 
 
-def _statistics(vec_normalize: VecNormalize) -> dict[str, RunningMeanStd]:
+def _statistics(vec_normalize: VecNormalize | None) -> dict[str, RunningMeanStd]:
+    """Return what VecNormalize has learned of rewards and observations, and nothing without it."""
+    if vec_normalize is None:
+        return {}
     observations = vec_normalize.obs_rms if vec_normalize.norm_obs else {}
     if isinstance(observations, RunningMeanStd):
         observations = {"observation": observations}
     return {"return": vec_normalize.ret_rms, **{f"obs/{key}": rms for key, rms in observations.items()}}
 
 
-def _vec_normalize_state(vec_normalize: VecNormalize) -> dict[str, Any]:
-    return {name: [rms.mean, rms.var, rms.count] for name, rms in _statistics(vec_normalize).items()}
-
-
-def _restore_vec_normalize(vec_normalize: VecNormalize, state: dict[str, Any]) -> None:
-    for name, rms in _statistics(vec_normalize).items():
-        rms.mean, rms.var, rms.count = state[name]
-
-
 def _eval_callbacks(callback: BaseCallback | None) -> list[EvalCallback]:
     if isinstance(callback, CallbackList):  # nested: SB3's progress bar puts the run's list into another
         return [found for child in callback.callbacks for found in _eval_callbacks(child)]
     return [callback] if isinstance(callback, EvalCallback) else []
-
-
-def _evaluation_state(callback: EvalCallback) -> dict[str, Any]:
-    return {
-        "n_calls": callback.n_calls,
-        "best_mean_reward": float(callback.best_mean_reward),
-        "timesteps": list(callback.evaluations_timesteps),
-        "results": [[float(x) for x in row] for row in callback.evaluations_results],
-        "lengths": [[int(x) for x in row] for row in callback.evaluations_length],
-    }
-
-
-def _restore_evaluations(callback: EvalCallback, state: dict[str, Any]) -> None:
-    callback.n_calls = state["n_calls"]
-    callback.best_mean_reward = state["best_mean_reward"]
-    callback.evaluations_timesteps = state["timesteps"]
-    callback.evaluations_results = state["results"]
-    callback.evaluations_length = state["lengths"]

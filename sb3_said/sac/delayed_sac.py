@@ -60,7 +60,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
         "MultiInputPolicy": DelayedSACPolicy,
     }
     counters = (*SafeSaveMixin.counters, "trained_ages")
-    own_classes: ClassVar[dict[str, type]] = {"replay_buffer_class": DelayedReplayBuffer}
+    own_classes = (DelayedReplayBuffer,)
     policy: DelayedSACPolicy
     replay_buffer: DelayedReplayBuffer
 
