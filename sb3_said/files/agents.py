@@ -116,7 +116,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
                 " networks were built with. Leave them out of the call."
             )
         policy = (arguments := arguments | kwargs).pop("policy_class", cls.policy_aliases["MlpPolicy"])
-        with readable(path, passing=(ValueError,)):
+        with readable(path, explained=(ValueError,)):
             if env is not None:
                 env = cls._wrap_env(env, arguments.get("verbose", 0))
                 cls._check_spaces(env, observation_space, action_space)
@@ -268,7 +268,7 @@ def _check_optimizer_state(where: str, state: dict[str, Any], shape: th.Size) ->
         if isinstance(value, th.Tensor):
             fits = th.broadcast_shapes(value.shape, shape) == shape and bool(th.isfinite(value).all())
         if not fits:
-            raise SavedFileError(f"its {name} of {where} does not fit {tuple(shape)} or is not finite")
+            raise SavedFileError(f"its part {where!r} does not fit: {name} is not of {tuple(shape)}, or not finite")
 
 
 def _check_tensors(where: str, saved: dict[str, Any], own: dict[str, Any], exact: bool = True) -> None:
@@ -277,15 +277,17 @@ def _check_tensors(where: str, saved: dict[str, Any], own: dict[str, Any], exact
         shape, dtype = own[name].shape, own[name].dtype
         if not isinstance(value, th.Tensor) or (value.shape, value.dtype) != (shape, dtype):
             given = (value.dtype, tuple(value.shape)) if isinstance(value, th.Tensor) else value
-            raise SavedFileError(f"its {where} does not fit: {name} is {given!s:.60}, expected {dtype, tuple(shape)}")
+            raise SavedFileError(
+                f"its part {where!r} does not fit: {name} is {given!s:.60}, expected {dtype, tuple(shape)}"
+            )
         if not th.isfinite(value).all():
-            raise SavedFileError(f"its {where} has NaN or infinite entries in {name}")
+            raise SavedFileError(f"its part {where!r} does not fit: {name} has NaN or infinite entries")
 
 
 def _check_names(where: str, saved: Collection[Any], own: Collection[Any], exact: bool = True) -> None:
     lacking, unknown = [x for x in own if x not in saved], [x for x in saved if x not in own]
     if unknown or (exact and lacking):
-        raise SavedFileError(f"its {where} does not fit: it lacks {lacking[:5]} and has unknown {unknown[:5]}")
+        raise SavedFileError(f"its part {where!r} does not fit: it lacks {lacking[:5]} and has unknown {unknown[:5]}")
 
 
 def _check_class(name: str, cls: type) -> None:

@@ -92,20 +92,18 @@ def load_metadata(path: PathOrFile) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def readable(source: PathOrFile, passing: tuple[type[Exception], ...] = ()) -> Iterator[None]:
+def readable(source: PathOrFile, explained: tuple[type[Exception], ...] = ()) -> Iterator[None]:
     """Turn whatever goes wrong while reading a damaged or forged file into one error that names the file.
 
-    :param passing: errors to leave as they are
+    :param explained: errors whose text says already what is wrong
     """
     name = f"'{os.fspath(source)}'" if isinstance(source, (str, os.PathLike)) else "the file object"
     try:
         yield
-    except SavedFileError as error:
-        raise SavedFileError(f"Cannot load {name}: {error}.") from error
+    except (SavedFileError, *explained) as error:
+        raise SavedFileError(f"Cannot load {name}: {str(error).rstrip('.')}.") from error
     except Exception as error:
-        if isinstance(error, (MemoryError, Warning, *passing)) or (
-            isinstance(error, OSError) and error.filename is not None
-        ):
+        if isinstance(error, (MemoryError, Warning)) or (isinstance(error, OSError) and error.filename is not None):
             raise  # an OSError with a name is from opening the file, and says so
         raise SavedFileError(
             f"Cannot load {name}: the file is damaged, incomplete, or was not written by sb3_said"
@@ -145,10 +143,9 @@ def _decode(node: Any, read: Callable[[int], np.ndarray]) -> Any:
         return [_decode(item, read) for item in node]
     if not isinstance(node, dict):
         return node
-    tag = next(iter(node), "")
-    if not tag.startswith("!"):
+    if not any(key.startswith("!") for key in node):
         return {key: _decode(item, read) for key, item in node.items()}
-    content = node[tag]
+    ((tag, content),) = node.items()
     if tag == "!tuple":
         return tuple(_decode(item, read) for item in content)
     if tag == "!dict":

@@ -101,7 +101,7 @@ def restore_training(model: SafeSaveMixin, path: str | Path, callback: BaseCallb
             f"In the run of {path} VecNormalize normalised {', '.join(state['vec_normalize']) or 'nothing'}, in this "
             f"model's environment {', '.join(statistics) or 'nothing'}; resume with the environment of the run."
         )
-    with readable(path, passing=(ValueError,)):
+    with readable(path, explained=(ValueError,)):
         restore_agent(model, state)
         replay_buffer.load_state_dict(state["replay_buffer"])
         for name, rms in statistics.items():
