@@ -57,7 +57,6 @@ class SafeSaveMixin(OffPolicyAlgorithm):
                 f"The saved file lacks arguments: {' '.join(missing.values())} {_advice(missing)}", stacklevel=2
             )
         tree = {
-            "class": type(self).__name__,
             "arguments": arguments,
             "missing": list(missing),
             "spaces": [space_as_data(self.observation_space), space_as_data(self.action_space)],
@@ -66,7 +65,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
         }
         if isinstance(path, (str, os.PathLike)) and pathlib.Path(path).suffix == "":
             path = f"{os.fspath(path)}.zip"
-        save_tree(path, tree, {"algorithm": type(self).__name__}, "agent")
+        save_tree(path, tree, kind=type(self).__name__)
 
     @classmethod
     def load(  # type: ignore[override]
@@ -79,17 +78,14 @@ class SafeSaveMixin(OffPolicyAlgorithm):
         force_reset: bool = True,
         **kwargs: Any,
     ) -> SelfSafeSave:
-        """Build an agent from a file, running no code from it.
+        """Build an agent from a file, running no code from it; with ``env=None`` it can ``predict``.
 
         :param path: path, with or without its ``.zip``, or a seekable binary file object
-        :param env: the environment to go on learning in; None is enough for ``predict``
-        :param device: where the agent computes
-        :param custom_objects: constructor arguments to take instead of those in the file, by name; others are ignored
-        :param print_system_info: print library versions, here and where the file was written
+        :param custom_objects: constructor arguments to take instead of those in the file; other names are ignored
         :param force_reset: of SB3, without effect: a file holds no episode to go on with, so learning starts a new one
         :param kwargs: constructor arguments to take instead of those in the file
-        :raises SavedFileError: if the file is damaged, foreign, forged, newer than this package, or of another class
-        :raises ValueError: for an environment or arguments that differ from the saved ones where they must not
+        :raises SavedFileError: if the file is damaged, foreign, forged, newer than this package or of another class,
+            or does not go with the environment or the arguments
         """
         path = _existing(path)
         if print_system_info:
@@ -98,9 +94,8 @@ class SafeSaveMixin(OffPolicyAlgorithm):
             print("== SAVED MODEL SYSTEM INFO ==", load_metadata(path)["versions"], sep="\n")
         names = cls._argument_names()
         given = {name: value for name, value in (custom_objects or {}).items() if name in names}
-        saved = load_tree(path, "agent")
+        saved = load_tree(path, cls.__name__)
         with readable(path):
-            _check_class(saved["class"], cls)
             _check_names("arguments", saved["arguments"], names, exact=False)
             arguments = {n: from_data(node) for n, node in saved["arguments"].items() if n not in given} | given
             observation_space, action_space = map(space_from_data, saved["spaces"])
@@ -139,18 +134,16 @@ class SafeSaveMixin(OffPolicyAlgorithm):
         exact_match: bool = True,
         device: th.device | str = "auto",
     ) -> None:
-        """Take over networks and optimizers from a file of :meth:`save`, or from state dicts as SB3 does.
+        """Take over networks and optimizers from state dicts, as SB3 does, or from a file of :meth:`save`.
 
-        :param load_path_or_dict: path, with or without its ``.zip``, seekable binary file, or ``get_parameters()``
         :param exact_match: refuse what lacks a part; False takes what there is
-        :param device: of SB3, without effect: networks stay where they are
         :raises SavedFileError: if the file cannot be read or does not fit
         """
         if isinstance(load_path_or_dict, dict):
             super().set_parameters(self._adapt_parameters(load_path_or_dict), exact_match, device)
             return
         path = _existing(load_path_or_dict)
-        saved = load_tree(path, "agent")
+        saved = load_tree(path, kind=None)
         with readable(path):
             _restore_parameters(self, saved["parameters"], exact_match)
 
@@ -189,8 +182,8 @@ class SafePolicyMixin(BasePolicy):
         arguments = self._get_constructor_parameters()
         arguments.pop("lr_schedule")  # the algorithm's
         own_spaces = [space_as_data(arguments.pop(name)) for name in ("observation_space", "action_space")]
-        tree = {"class": type(self).__name__, "arguments": as_data(arguments, "arguments"), "spaces": own_spaces}
-        save_tree(path, tree | {"state_dict": self.state_dict()}, {"policy": type(self).__name__}, "policy")
+        tree = {"arguments": as_data(arguments, "arguments"), "spaces": own_spaces, "state_dict": self.state_dict()}
+        save_tree(path, tree, kind=type(self).__name__)
 
     @classmethod
     def load(cls: type[SelfSafePolicy], path: PathOrFile, device: th.device | str = "auto") -> SelfSafePolicy:
@@ -200,9 +193,8 @@ class SafePolicyMixin(BasePolicy):
         :param device: where the policy computes
         :raises SavedFileError: if the file is damaged, foreign, forged, newer than this package, or of another class
         """
-        saved = load_tree(path, "policy")
+        saved = load_tree(path, cls.__name__)
         with readable(path):
-            _check_class(saved["class"], cls)
             arguments = from_data(saved["arguments"])
             policy = cls(*map(space_from_data, saved["spaces"]), ConstantSchedule(0.0), **arguments)
             _check_tensors("state_dict", saved["state_dict"], policy.state_dict())
@@ -288,11 +280,6 @@ def _check_names(where: str, saved: Collection[Any], own: Collection[Any], exact
     lacking, unknown = [x for x in own if x not in saved], [x for x in saved if x not in own]
     if unknown or (exact and lacking):
         raise SavedFileError(f"its part {where!r} does not fit: it lacks {lacking[:5]} and has unknown {unknown[:5]}")
-
-
-def _check_class(name: str, cls: type) -> None:
-    if name != cls.__name__:
-        raise SavedFileError(f"it holds a {name}, where {cls.__name__} was expected: load it with {name}.load")
 
 
 def _existing(path: PathOrFile) -> PathOrFile:

@@ -7,14 +7,13 @@ plain values, arrays and tensors and nothing else, so a file from a stranger run
 from __future__ import annotations
 
 import contextlib
-import importlib.metadata
 import json
 import math
 import os
-import platform
+import sys
 import zipfile
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -50,35 +49,32 @@ def save_tree(path: PathOrFile, tree: Any, metadata: dict[str, Any] | None = Non
     {'step': 3, 'betas': (0.9, 0.999), 'weight': tensor([0., 0.])}
     """
     arrays: list[np.ndarray] = []
-    description = {"format": FORMAT, "kind": kind, "versions": _versions(), "metadata": metadata or {}}
-    document = json.dumps({**description, "tree": _encode(tree, "tree", arrays)})
+    root = _encode(tree, "tree", arrays)
+    libraries = ("sb3_said", "stable_baselines3", "torch", "gymnasium", "numpy")
+    versions = {name: sys.modules[name].__version__ for name in libraries if name in sys.modules}
+    document = {"format": FORMAT, "kind": kind, "versions": versions, "metadata": metadata or {}, "tree": root}
+    text = json.dumps(document)
     with replacing(path) as file, zipfile.ZipFile(file, "w") as archive:
-        archive.writestr(zipfile.ZipInfo("tree.json"), document)  # ZipInfo without a date: equal data, equal bytes
+        archive.writestr(zipfile.ZipInfo("tree.json"), text)  # ZipInfo without a date: equal data, equal bytes
         for index, array in enumerate(arrays):
             with archive.open(zipfile.ZipInfo(f"{index}.npy"), "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, array, version=(1, 0), allow_pickle=False)
 
 
-def load_tree(path: PathOrFile, kind: str = "tree") -> Any:
+def load_tree(path: PathOrFile, kind: str | None = "tree") -> Any:
     """Read what :func:`save_tree` wrote, running no code from the file.
 
     :param path: of the file, or a seekable binary file object
-    :param kind: as it was written
+    :param kind: as it was written; None takes any
     :raises SavedFileError: if it is no such file, is damaged, or comes from a newer version of this package
     """
-    with readable(path), _opened(path) as archive:
-        document = _document(archive)
-        if document["kind"] != kind:
+    with readable(path), _opened(path) as (archive, document):
+        if kind not in (None, document["kind"]):
             raise SavedFileError(f"it holds data of kind {document['kind']!r}, where {kind!r} was expected")
-        unread = set(archive.namelist()) - {"tree.json"}
-
-        def read(index: int) -> np.ndarray:
-            unread.remove(f"{index}.npy")  # an array named twice would take memory that the file does not
-            return _read_array(archive, f"{index}.npy")
-
-        tree = _decode(document["tree"], read)
-        if unread:
-            raise SavedFileError(f"its arrays {sorted(unread)[:5]} have no place in the data")
+        arrays = (_read_array(archive, f"{index}.npy") for index in range(len(archive.namelist()) - 1))
+        tree = _decode(document["tree"], arrays)
+        if next(arrays, None) is not None:
+            raise SavedFileError("it holds more arrays than its data names")
         return tree
 
 
@@ -87,12 +83,12 @@ def load_metadata(path: PathOrFile) -> dict[str, Any]:
 
     :raises SavedFileError: as :func:`load_tree`
     """
-    with readable(path), _opened(path) as archive:
-        return {name: value for name, value in _document(archive).items() if name != "tree"}
+    with readable(path), _opened(path) as (_, document):
+        return {name: value for name, value in document.items() if name != "tree"}
 
 
 @contextlib.contextmanager
-def readable(source: PathOrFile, explained: tuple[type[Exception], ...] = ()) -> Iterator[None]:
+def readable(source: PathOrFile, explained: tuple[type[Exception], ...] = (SavedFileError,)) -> Iterator[None]:
     """Turn whatever goes wrong while reading a damaged or forged file into one error that names the file.
 
     :param explained: errors whose text says already what is wrong
@@ -100,7 +96,7 @@ def readable(source: PathOrFile, explained: tuple[type[Exception], ...] = ()) ->
     name = f"'{os.fspath(source)}'" if isinstance(source, (str, os.PathLike)) else "the file object"
     try:
         yield
-    except (SavedFileError, *explained) as error:
+    except explained as error:
         raise SavedFileError(f"Cannot load {name}: {str(error).rstrip('.')}.") from error
     except Exception as error:
         if isinstance(error, (MemoryError, Warning)) or (isinstance(error, OSError) and error.filename is not None):
@@ -112,7 +108,7 @@ def readable(source: PathOrFile, explained: tuple[type[Exception], ...] = ()) ->
 
 
 def _encode(value: Any, where: str, arrays: list[np.ndarray]) -> Any:
-    """Return a JSON node, and put arrays aside. An object whose key starts with ``!`` stands for what JSON lacks."""
+    """Return a JSON node and put arrays aside, in order. An object with a key ``!...`` stands for what JSON lacks."""
     if value is None or type(value) in (bool, int, float, str):  # exact types: a subclass would come back as its parent
         return value
     if type(value) in (list, tuple):
@@ -126,39 +122,39 @@ def _encode(value: Any, where: str, arrays: list[np.ndarray]) -> Any:
         return dict(items) if is_plain else {"!dict": items}
     try:
         if isinstance(value, th.Tensor):
-            tag, array = "!tensor", value.numpy(force=True)
+            kind, array = "tensor", value.numpy(force=True)
         elif isinstance(value, (np.ndarray, np.generic)):
-            tag, array = "!array" if isinstance(value, np.ndarray) else "!scalar", np.asarray(value)
+            kind, array = "array" if isinstance(value, np.ndarray) else "scalar", np.asarray(value)
         else:
             raise TypeError("expected dict, list, tuple, None, bool, int, float, str, a tensor or an array")
         _check_dtype(array.dtype)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{where}: cannot save {value!r:.100} of type {type(value).__name__}: {error}.") from error
     arrays.append(array)
-    return {tag: len(arrays) - 1}
+    return {"!array": kind}
 
 
-def _decode(node: Any, read: Callable[[int], np.ndarray]) -> Any:
+def _decode(node: Any, arrays: Iterator[np.ndarray]) -> Any:
     if isinstance(node, list):
-        return [_decode(item, read) for item in node]
+        return [_decode(item, arrays) for item in node]
     if not isinstance(node, dict):
         return node
     if not any(key.startswith("!") for key in node):
-        return {key: _decode(item, read) for key, item in node.items()}
+        return {key: _decode(item, arrays) for key, item in node.items()}
     ((tag, content),) = node.items()
     if tag == "!tuple":
-        return tuple(_decode(item, read) for item in content)
+        return tuple(_decode(item, arrays) for item in content)
     if tag == "!dict":
-        return {key: _decode(item, read) for key, item in content}
-    if tag not in ("!tensor", "!array", "!scalar"):
+        return {key: _decode(item, arrays) for key, item in content}
+    if tag != "!array" or content not in ("tensor", "array", "scalar"):
         raise SavedFileError(f"unknown entry {tag!r}")
-    array = read(content)
-    return th.from_numpy(array) if tag == "!tensor" else array if tag == "!array" else array[()]
+    array = next(arrays)
+    return th.from_numpy(array) if content == "tensor" else array if content == "array" else array[()]
 
 
 @contextlib.contextmanager
-def _opened(source: PathOrFile) -> Iterator[zipfile.ZipFile]:
-    """Open an archive whose members have the names and sizes that :func:`save_tree` gives, before reading any."""
+def _opened(source: PathOrFile) -> Iterator[tuple[zipfile.ZipFile, dict[str, Any]]]:
+    """Open an archive and read its document, once its members have the names and sizes of :func:`save_tree`."""
     with contextlib.ExitStack() as stack:
         file = stack.enter_context(open(source, "rb")) if isinstance(source, (str, os.PathLike)) else source
         n_bytes = file.seek(0, os.SEEK_END)
@@ -176,7 +172,13 @@ def _opened(source: PathOrFile) -> Iterator[zipfile.ZipFile]:
             raise SavedFileError("its members are compressed, which sb3_said never does and a zip bomb needs")
         if sum(info.file_size for info in archive.infolist()) > n_bytes:
             raise SavedFileError("its members claim to be larger than the file")
-        yield archive
+        document = json.loads(archive.read("tree.json"))
+        if document["format"] > FORMAT:
+            raise SavedFileError(
+                f"its format number is {document['format']}, this sb3_said reads up to {FORMAT}: upgrade sb3_said"
+                f" (the file was written with {document.get('versions')})"
+            )
+        yield archive, document
 
 
 def _refuse_pickle(is_pickle: bool) -> None:
@@ -187,16 +189,6 @@ def _refuse_pickle(is_pickle: bool) -> None:
             " what it learned: policy.load_state_dict(loaded.policy.state_dict()), or"
             " set_parameters(loaded.get_parameters())"
         )
-
-
-def _document(archive: zipfile.ZipFile) -> dict[str, Any]:
-    document = json.loads(archive.read("tree.json"))
-    if document["format"] > FORMAT:
-        raise SavedFileError(
-            f"its format number is {document['format']}, this sb3_said reads up to {FORMAT}: upgrade sb3_said"
-            f" (the file was written with {document.get('versions')})"
-        )
-    return document
 
 
 def _read_array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
@@ -218,11 +210,3 @@ def _read_array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
 def _check_dtype(dtype: np.dtype) -> None:
     if dtype.kind not in "biufc":
         raise SavedFileError(f"arrays must be of numbers or bools, not {dtype}")
-
-
-def _versions() -> dict[str, str]:
-    versions = {"python": platform.python_version()}
-    for package in ("sb3_said", "stable_baselines3", "torch", "gymnasium", "numpy"):
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            versions[package] = importlib.metadata.version(package)
-    return versions

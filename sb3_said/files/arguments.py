@@ -29,10 +29,7 @@ _PARTS: dict[type, Callable[[Any], tuple[Any, ...]]] = {
     FloatSchedule: lambda s: (s.value_schedule,),
     LinearSchedule: lambda s: (s.start, s.end, s.end_fraction),
     NormalActionNoise: lambda n: (n._mu, n._sigma, np.dtype(n._dtype).str),
-    OrnsteinUhlenbeckActionNoise: lambda n: (
-        *(n._mu, n._sigma, n._theta, n._dt, n.initial_noise),
-        np.dtype(n._dtype).str,
-    ),
+    OrnsteinUhlenbeckActionNoise: lambda n: (n._mu, n._sigma, n._theta, n._dt, n.initial_noise, np.dtype(n._dtype).str),
 }
 _BUILDERS = {cls.__name__: cls for cls in _PARTS}
 

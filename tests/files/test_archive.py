@@ -207,14 +207,14 @@ def test_a_flipped_byte_is_an_error_or_harmless(data):
 @pytest.mark.parametrize(
     "tree",
     [
-        {"!tensor": 1},
-        {"!tensor": [0]},
-        {"!array": "../0"},
-        [{"!array": 0}, {"!tensor": 0}],  # twice the memory
+        {"!array": "object"},
+        {"!array": ["tensor"]},
+        {"!array": "tensor", "more": 1},
+        [{"!array": "tensor"}, {"!array": "tensor"}],
         None,
         {"!class": "torch.nn.ReLU"},
         {"!object": ["gymnasium.Discrete", {"n": 2}]},
-        {"!dict": [[[], {"!array": 0}]]},
+        {"!dict": [[[], {"!array": "tensor"}]]},
         {"!tuple": 3},
     ],
     ids=str,
@@ -292,7 +292,7 @@ def test_forged_headers_are_refused_before_memory_is_taken(descr, shape, content
 def test_members_that_do_not_belong_are_refused(names, tmp_path):
     save_tree(tmp_path / "tree", th.zeros(1))
     edit(tmp_path / "tree", lambda members: members | dict.fromkeys(names, members["0.npy"]))
-    with pytest.raises(SavedFileError, match=r"expected an archive of|have no place"):
+    with pytest.raises(SavedFileError, match=r"expected an archive of|more arrays"):
         load_tree(tmp_path / "tree")
 
 

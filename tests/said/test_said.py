@@ -170,7 +170,7 @@ def test_a_file_with_pickles_is_refused(trained, tmp_path):
 
 def test_another_algorithms_file_is_refused(tmp_path):
     make(cls=DelayedSAC).save(tmp_path / "sac")
-    with pytest.raises(ValueError, match="holds a DelayedSAC, where SAID was expected"):
+    with pytest.raises(ValueError, match="kind 'DelayedSAC', where 'SAID' was expected"):
         SAID.load(tmp_path / "sac")
 
 
