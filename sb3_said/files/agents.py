@@ -80,6 +80,8 @@ class SafeSaveMixin(OffPolicyAlgorithm):
     ) -> SelfSafeSave:
         """Build an agent from a file, running no code from it; with ``env=None`` it can ``predict``.
 
+        The arguments are those of SB3's ``load``:
+
         :param path: path, with or without its ``.zip``, or a seekable binary file object
         :param custom_objects: constructor arguments to take instead of those in the file; other names are ignored
         :param force_reset: of SB3, without effect: a file holds no episode to go on with, so learning starts a new one
@@ -117,7 +119,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
                 cls._check_spaces(env, observation_space, action_space)
             arguments |= {"device": device, "_init_setup_model": False}
             model = cls(policy, env, **arguments)  # type: ignore[arg-type]
-            _restore_counters(model, saved["counters"])
+            _restore_counters(model, saved["counters"])  # _setup_model may ask whether the agent is new
             if env is None:
                 model.observation_space, model.action_space = observation_space, action_space
                 model.n_envs = saved["n_envs"]

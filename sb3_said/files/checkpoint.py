@@ -86,22 +86,23 @@ def restore_training(model: SafeSaveMixin, path: str | Path, callback: BaseCallb
     :param model: made with the arguments of the run
     :param path: of a ``checkpoint.zip``
     :param callback: made as the run's, whose ``EvalCallback`` evaluations are restored
-    :raises ValueError: when the checkpoint does not fit the model
+    :raises SavedFileError: when the file is damaged or forged, or does not fit the model
+    :raises ValueError: when the model's replay buffer has no ``load_state_dict``
     """
     replay_buffer, eval_callbacks = _replay_buffer(model), _eval_callbacks(callback)
     statistics = _statistics(model.get_vec_normalize_env())
     state = load_tree(path)
-    if len(eval_callbacks) != len(state["evaluations"]):
-        raise ValueError(
-            f"The run of {path} had {len(state['evaluations'])} EvalCallback and is resumed with "
-            f"{len(eval_callbacks)}; resume with the callbacks of the run."
-        )
-    if statistics.keys() != state["vec_normalize"].keys():
-        raise ValueError(
-            f"In the run of {path} VecNormalize normalised {', '.join(state['vec_normalize']) or 'nothing'}, in this "
-            f"model's environment {', '.join(statistics) or 'nothing'}; resume with the environment of the run."
-        )
     with readable(path, explained=(ValueError,)):
+        if len(eval_callbacks) != len(state["evaluations"]):
+            raise ValueError(
+                f"the run had {len(state['evaluations'])} EvalCallback and is resumed with {len(eval_callbacks)}; "
+                "resume with the callbacks of the run"
+            )
+        if statistics.keys() != state["vec_normalize"].keys():
+            raise ValueError(
+                f"in the run VecNormalize normalised {', '.join(state['vec_normalize']) or 'nothing'}, in this model's "
+                f"environment {', '.join(statistics) or 'nothing'}; resume with the environment of the run"
+            )
         restore_agent(model, state)
         replay_buffer.load_state_dict(state["replay_buffer"])
         for name, rms in statistics.items():

@@ -2,7 +2,11 @@
 
 import io
 import json
+import pathlib
 import pickle
+import signal
+import subprocess
+import sys
 import tracemalloc
 import zipfile
 from collections import OrderedDict, deque
@@ -173,6 +177,24 @@ def test_an_optimizer_goes_on_as_if_never_saved(optimizer_class, tmp_path):
         step(resumed_network, resumed_optimizer)
     assert same(dict(network.state_dict()), dict(resumed_network.state_dict()))
     assert same(optimizer.state_dict(), resumed_optimizer.state_dict())
+
+
+def test_a_kill_in_the_middle_of_a_write_leaves_the_old_file(tmp_path):
+    save_tree(tmp_path / "tree", "old")
+    script = (
+        "import os, signal, sys, numpy as np\n"
+        "from sb3_said.files.archive import save_tree\n"
+        "write, left = np.lib.format.write_array, [1, 2]\n"
+        "def killed(*args, **kwargs):\n"
+        "    left.pop() if left else os.kill(os.getpid(), signal.SIGKILL)\n"
+        "    write(*args, **kwargs)\n"
+        "np.lib.format.write_array = killed\n"
+        "save_tree(sys.argv[1], [np.zeros(3_000_000)] * 4)\n"
+    )
+    root = pathlib.Path(tree_file.__file__).parents[2]  # importable from there, installed or not
+    killed = subprocess.run([sys.executable, "-c", script, str(tmp_path / "tree")], cwd=root, check=False)
+    assert killed.returncode == -signal.SIGKILL and load_tree(tmp_path / "tree") == "old"
+    assert sum(path.stat().st_size for path in tmp_path.iterdir()) > 2 * 24e6  # it was amid the new one
 
 
 # --- files that are not what they should be ---
