@@ -90,7 +90,7 @@ def test_schedules_and_noise_come_back():
 
 
 def test_the_zoos_schedule_is_kept_as_sb3s():
-    schedule = pytest.importorskip("rl_zoo3.utils").linear_schedule("lin_1e-3".removeprefix("lin_"))
+    schedule = pytest.importorskip("rl_zoo3.utils").linear_schedule("1e-3")
     loaded = from_data(trip(as_data(schedule, "learning_rate")))
     assert type(loaded) is LinearSchedule
     np.testing.assert_allclose([loaded(x) for x in (1, 0.3, 0)], [schedule(x) for x in (1, 0.3, 0)], atol=1e-18)
