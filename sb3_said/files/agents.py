@@ -234,9 +234,12 @@ def _restore_counters(model: SafeSaveMixin, saved: dict[str, Any]) -> None:
     _check_names("counters", saved, model.counters)
     for name in model.counters:
         value, own = saved[name], getattr(model, name)
-        is_list = type(value) is list and all(type(item) is int for item in value)
-        if type(value) is not type(own) if isinstance(own, (int, float)) else not (value is None or is_list):
-            raise SavedFileError(f"its {name} is {value!r:.50}")
+        if isinstance(own, (int, float)):
+            fits = type(value) is type(own)
+        else:  # ages, where it has learned
+            fits = value is None or (type(value) is list and all(type(item) is int for item in value))
+        if not fits:
+            raise SavedFileError(f"its part 'counters' does not fit: {name} is {value!r:.50}")
         setattr(model, name, value)
 
 

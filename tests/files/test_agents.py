@@ -178,8 +178,9 @@ def test_an_agent_comes_back_whole(kwargs, tmp_path):
     assert loaded.num_timesteps == 40 and loaded._n_updates > model._n_updates
 
 
-def test_gradient_steps_after_loading_are_the_same(tmp_path):
-    model = make_sac().learn(20)
+@pytest.mark.parametrize("optimizer_class", [th.optim.Adam, th.optim.AdamW, th.optim.SGD, th.optim.Adafactor])
+def test_gradient_steps_after_loading_are_the_same(optimizer_class, tmp_path):
+    model = make_sac(policy_kwargs={"net_arch": [8], "optimizer_class": optimizer_class}).learn(20)
     model.save(tmp_path / "agent")
     before = {name: value.clone() for name, value in model.policy.state_dict().items()}
     loaded = DelayedSAC.load(tmp_path / "agent", device="cpu")

@@ -151,34 +151,6 @@ def test_equal_trees_give_equal_bytes():
     assert first.getvalue() == second.getvalue()
 
 
-@pytest.mark.parametrize("optimizer_class", [th.optim.Adam, th.optim.AdamW, th.optim.SGD])
-def test_an_optimizer_goes_on_as_if_never_saved(optimizer_class, tmp_path):
-    def step(network, optimizer):
-        optimizer.zero_grad()
-        network(th.linspace(-1, 1, 12).reshape(4, 3)).square().sum().backward()
-        optimizer.step()
-
-    def build():
-        network = th.nn.Linear(3, 2)
-        return network, optimizer_class(network.parameters(), lr=0.01)
-
-    network, optimizer = build()
-    for _ in range(3):
-        step(network, optimizer)
-    save_tree(tmp_path / "checkpoint", {"network": network.state_dict(), "optimizer": optimizer.state_dict()})
-
-    tree = load_tree(tmp_path / "checkpoint")
-    resumed_network, resumed_optimizer = build()
-    resumed_network.load_state_dict(tree["network"])
-    resumed_optimizer.load_state_dict(tree["optimizer"])
-    assert same(optimizer.state_dict(), resumed_optimizer.state_dict())
-    for _ in range(3):
-        step(network, optimizer)
-        step(resumed_network, resumed_optimizer)
-    assert same(dict(network.state_dict()), dict(resumed_network.state_dict()))
-    assert same(optimizer.state_dict(), resumed_optimizer.state_dict())
-
-
 def test_a_kill_in_the_middle_of_a_write_leaves_the_old_file(tmp_path):
     save_tree(tmp_path / "tree", "old")
     script = (
