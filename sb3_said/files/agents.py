@@ -1,167 +1,71 @@
-"""Saving and loading of Stable-Baselines3 algorithms and policies without pickle: a stranger's file runs no code."""
+"""Agents and policies in files without pickle: constructor arguments, counters and state dicts, and nothing else."""
 
 from __future__ import annotations
 
-import contextlib
+import inspect
 import os
 import pathlib
 import warnings
-from collections.abc import Iterable, Iterator
-from typing import Any, TypeVar
+from collections.abc import Collection
+from typing import Any, ClassVar, TypeVar
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.save_util import load_from_zip_file, recursive_getattr, recursive_setattr
+from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.utils import (
-    ConstantSchedule,
-    check_for_correct_spaces,
-    get_device,
-    get_system_info,
-)
+from stable_baselines3.common.utils import ConstantSchedule, check_for_correct_spaces, get_device, get_system_info
 
-from sb3_said.files.archive import (
-    Decoder,
-    Encoder,
-    PathOrFile,
-    PickleRefusedError,
-    SavedFileError,
-    load_metadata,
-    load_tree,
-    read_file,
-    readable,
-    save_tree,
-    write_file,
-)
-from sb3_said.files.registry import ObjectDecoder, ObjectEncoder
-
-__all__ = [
-    "PickleRefusedError",
-    "SafePolicyMixin",
-    "SafeSaveMixin",
-    "SavedFileError",
-    "explained_refusal",
-    "load_algorithm_file",
-    "load_metadata",
-    "load_tree",
-    "save_algorithm",
-    "save_tree",
-]
+from sb3_said.files.archive import PathOrFile, SavedFileError, load_metadata, load_tree, readable, save_tree
+from sb3_said.files.arguments import as_data, from_data, space_as_data, space_from_data
 
 SelfSafeSave = TypeVar("SelfSafeSave", bound="SafeSaveMixin")
 SelfSafePolicy = TypeVar("SelfSafePolicy", bound="SafePolicyMixin")
+_COUNTERS = ("num_timesteps", "_total_timesteps", "_episode_num", "_n_updates", "_current_progress_remaining")  # SB3's
+_NO_ARGUMENTS = {"self", "policy", "env", "device", "tensorboard_log", "_init_setup_model"}  # of an agent's in a file
 
 
-def save_algorithm(
-    path: PathOrFile, model: BaseAlgorithm, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None
-) -> None:
-    """Write an SB3 algorithm to a zip of JSON and tensors, in the way and with the choices of its own ``save``.
+class SafeSaveMixin(OffPolicyAlgorithm):
+    """Makes an SB3 off-policy algorithm save to and load from files without pickle. Name it before the algorithm.
 
-    Neither the environment nor the replay buffer is written. An attribute that holds a function or an object of an
-    unregistered class cannot be written without pickle: it is named in one warning and in the file.
-
-    :param path: where to write; without a suffix, ``.zip`` is added. Or a binary file object.
-    :param exclude: attributes to leave out besides those the algorithm leaves out itself
-    :param include: attributes to write although the algorithm leaves them out
-    """
-    state_dict_names, variable_names = model._get_torch_save_params()
-    excluded = set(exclude or ()) | set(model._excluded_save_params())
-    excluded -= set(include or ())
-    excluded |= {name.split(".")[0] for name in state_dict_names + variable_names}
-    excluded.add("lr_schedule")  # made from learning_rate by _setup_model, in every algorithm
-
-    data: dict[str, Any] = {}
-    blobs: dict[str, Any] = {}
-    missing: dict[str, str] = {}
-    for name, value in vars(model).items():
-        if name in excluded:
-            continue
-        encoder = ObjectEncoder()
-        try:
-            data[name] = encoder.encode(value, name)
-        except (ValueError, RecursionError) as error:
-            missing[name] = str(error)
-        else:
-            blobs |= encoder.blobs
-    if missing:
-        warnings.warn(
-            "Attributes that are not in the saved file, because functions and objects of unregistered classes cannot be"
-            f" written without pickle: {'; '.join(missing.values())}. To load the file with them, use load(...,"
-            f" custom_objects={{{', '.join(f'{name!r}: ...' for name in missing)}}}); a class of your own can be"
-            " registered with sb3_said.files.registry.register_class.",
-            stacklevel=3,
-        )
-    variables = {name: recursive_getattr(model, name) for name in variable_names}
-    tensors = Encoder()
-    root = {
-        "data": data,
-        "missing": sorted(missing),
-        "params": tensors.encode(model.get_parameters(), "params"),
-        "pytorch_variables": tensors.encode(variables, "pytorch_variables"),
-    }
-    if isinstance(path, (str, os.PathLike)) and pathlib.Path(path).suffix == "":
-        path = f"{os.fspath(path)}.zip"
-    write_file(path, "algorithm", root, blobs | tensors.blobs, {"algorithm": type(model).__name__})
-
-
-def load_algorithm_file(
-    path: PathOrFile,
-    device: th.device | str = "auto",
-    custom_objects: dict[str, Any] | None = None,
-    allow_pickle: bool = False,
-    load_data: bool = True,
-) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any] | None]:
-    """Read what :func:`save_algorithm` wrote, running no code from the file.
-
-    :param path: path, with or without its ``.zip``, or a seekable binary file object
-    :param device: where attributes and variables that are tensors go. State dicts stay on the CPU:
-        ``load_state_dict`` copies them to where the networks are.
-    :param custom_objects: attributes to take instead of those in the file, which are then not even decoded
-    :param allow_pickle: also read Stable-Baselines3's own files, which can run any code: only for files you trust
-    :param load_data: False skips the attributes and reads only parameters
-    :return: attributes, state dicts by name, and other PyTorch variables by name
-    :raises ValueError: if the file is damaged, foreign, newer than this package, names an unregistered class, or holds
-        a pickle and ``allow_pickle`` is False
-    """
-    path = _existing(path)
-    custom_objects = custom_objects or {}
-    if allow_pickle and _holds_pickle(path):
-        pickled, params, variables = load_from_zip_file(path, load_data, custom_objects, device)  # type: ignore[arg-type]
-        return pickled or {}, params, variables
-    with explained_refusal("load"):
-        saved = read_file(path, "algorithm")
-    decoder = ObjectDecoder(saved.blobs, get_device(device))
-    with readable(path):
-        nodes, missing = saved.root["data"] if load_data else {}, saved.root["missing"]
-        supplied = {name: value for name, value in custom_objects.items() if name in nodes or name in missing}
-        data = {name: decoder.decode(node) for name, node in nodes.items() if name not in supplied} | supplied
-        variables = decoder.decode(saved.root["pytorch_variables"])
-        params = Decoder(saved.blobs).decode(saved.root["params"])
-    absent = [name for name in missing if name not in supplied]
-    if absent and load_data:
-        warnings.warn(
-            f"The file lacks {', '.join(absent)}, which could not be written without pickle: the algorithm's defaults"
-            f" are used. To supply them, use load(..., custom_objects={{{', '.join(f'{n!r}: ...' for n in absent)}}}).",
-            stacklevel=3,
-        )
-    return data, params, variables
-
-
-class SafeSaveMixin(BaseAlgorithm):
-    """Makes an SB3 algorithm save to and load from files without pickle. Name it before the algorithm.
-
-    >>> from stable_baselines3 import SAC
-    >>> class SafeSAC(SafeSaveMixin, SAC):
-    ...     pass
+    Every argument of the constructor after ``policy, env`` must be an attribute of the same name. A subclass adds what
+    it counts to ``counters``, and to ``own_classes`` the classes that its constructor takes where none are given.
     """
 
-    def save(  # type: ignore[override]
-        self, path: PathOrFile, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None
-    ) -> None:
-        """Write the agent to a file; see :func:`save_algorithm`."""
-        save_algorithm(path, self, exclude, include)
+    counters: ClassVar[tuple[str, ...]] = _COUNTERS
+    own_classes: ClassVar[tuple[type, ...]] = ()
+
+    def save(self, path: PathOrFile) -> None:  # type: ignore[override]
+        """Write the agent to a file, without its environment and replay buffer.
+
+        A constructor argument that cannot be written without pickle is named in a warning and in the file.
+
+        :param path: where to write; without a suffix, ``.zip`` is added. Or a binary file object.
+        :raises ValueError: for spaces other than Box and Dict of Box
+        """
+        arguments, missing = {}, {}
+        for name in sorted(self._argument_names()):
+            value = getattr(self, {"stats_window_size": "_stats_window_size"}.get(name, name))
+            if not any(value is own for own in (self.policy_aliases["MlpPolicy"], *self.own_classes)):
+                try:
+                    arguments[name] = as_data(value, name)
+                except ValueError as error:
+                    missing[name] = str(error)
+        if missing:
+            warnings.warn(
+                f"The saved file lacks arguments: {' '.join(missing.values())} {_advice(missing)}", stacklevel=2
+            )
+        tree = {
+            "arguments": arguments,
+            "missing": list(missing),
+            "spaces": [space_as_data(self.observation_space), space_as_data(self.action_space)],
+            "n_envs": self.n_envs,
+            **agent_state(self),
+        }
+        if isinstance(path, (str, os.PathLike)) and pathlib.Path(path).suffix == "":
+            path = f"{os.fspath(path)}.zip"
+        save_tree(path, tree, kind=type(self).__name__)
 
     @classmethod
     def load(  # type: ignore[override]
@@ -172,67 +76,88 @@ class SafeSaveMixin(BaseAlgorithm):
         custom_objects: dict[str, Any] | None = None,
         print_system_info: bool = False,
         force_reset: bool = True,
-        allow_pickle: bool = False,
         **kwargs: Any,
     ) -> SelfSafeSave:
-        """Build an agent from a file, running no code from it.
+        """Build an agent from a file, running no code from it; with ``env=None`` it can ``predict``.
 
-        The arguments are those of SB3's ``load``, and one more.
+        The arguments are those of SB3's ``load``:
 
         :param path: path, with or without its ``.zip``, or a seekable binary file object
-        :param env: the environment to go on learning in; None is enough for ``predict``
-        :param device: where the agent computes
-        :param custom_objects: attributes to take instead of those in the file, by name
-        :param print_system_info: print library versions, here and where the file was written
-        :param force_reset: reset ``env`` before learning goes on
-        :param allow_pickle: also load files of SB3's own ``save``, which can run any code: only for files you trust
-        :param kwargs: attributes to set to other values than the file has
-        :raises ValueError: if the file cannot be loaded safely (see :func:`load_algorithm_file`), or its spaces or
-            policy arguments differ from those given
+        :param custom_objects: constructor arguments to take instead of those in the file; other names are ignored
+        :param force_reset: of SB3, without effect: a file holds no episode to go on with, so learning starts a new one
+        :param kwargs: constructor arguments to take instead of those in the file
+        :raises SavedFileError: if the file is damaged, foreign, forged, newer than this package or of another class,
+            or does not go with the environment or the arguments
         """
         path = _existing(path)
-        if allow_pickle and _holds_pickle(path):
-            return super().load(
-                path,  # type: ignore[arg-type]
-                env,
-                device,
-                custom_objects,
-                print_system_info,
-                force_reset,
-                **kwargs,
-            )
         if print_system_info:
             print("== CURRENT SYSTEM INFO ==")
             get_system_info()
             print("== SAVED MODEL SYSTEM INFO ==", load_metadata(path)["versions"], sep="\n")
-        data, params, variables = load_algorithm_file(path, device, custom_objects)
-        _check_data(data, kwargs)
-        if env is not None:
-            env = cls._wrap_env(env, data.get("verbose", 0))
-            cls._check_spaces(env, data["observation_space"], data["action_space"])
-            if force_reset:
-                data["_last_obs"] = None
-            data["n_envs"] = env.num_envs
-
-        model = cls(policy=data["policy_class"], env=env, device=device, _init_setup_model=False)  # type: ignore[call-arg]
-        vars(model).update(data | kwargs)
-        model._setup_model()
-        try:
-            model.set_parameters(params, exact_match=True, device=device)
-        except (RuntimeError, ValueError) as error:
+        names = cls._argument_names()
+        given = {name: value for name, value in (custom_objects or {}).items() if name in names}
+        saved = load_tree(path, cls.__name__)
+        with readable(path):
+            _check_names("arguments", saved["arguments"], names, exact=False)
+            arguments = {n: from_data(node) for n, node in saved["arguments"].items() if n not in given} | given
+            observation_space, action_space = map(space_from_data, saved["spaces"])
+            if absent := [name for name in saved["missing"] if name not in given | kwargs]:
+                warnings.warn(
+                    f"The file lacks {', '.join(absent)}: {cls.__name__} takes its defaults. {_advice(absent)}",
+                    stacklevel=2,
+                )
+        stored = arguments.get("policy_kwargs")
+        if stored is not None and kwargs.get("policy_kwargs", stored) != stored:
             raise ValueError(
-                f"The parameters in the file do not fit {cls.__name__} with policy_kwargs {model.policy_kwargs}:"
-                f" {error}. Load it with the class that saved it; policy_kwargs that could not be written are given as"
-                " load(..., custom_objects={'policy_kwargs': ...})."
-            ) from error
-        for name, value in (variables or {}).items():
-            # None: the algorithm has this variable only in another configuration (SAC's fixed or learned entropy).
-            if value is not None:
-                recursive_setattr(model, f"{name}.data", value)
-        if model.use_sde:
+                f"The given policy_kwargs {kwargs['policy_kwargs']} differ from {stored} in the file, which the saved"
+                " networks were built with. Leave them out of the call."
+            )
+        policy = (arguments := arguments | kwargs).pop("policy_class", cls.policy_aliases["MlpPolicy"])
+        with readable(path, explained=(ValueError,)):
+            if env is not None:
+                env = cls._wrap_env(env, arguments.get("verbose", 0))
+                cls._check_spaces(env, observation_space, action_space)
+            arguments |= {"device": device, "_init_setup_model": False}
+            model = cls(policy, env, **arguments)  # type: ignore[arg-type]
+            _restore_counters(model, saved["counters"])  # _setup_model may ask whether the agent is new
+            if env is None:
+                model.observation_space, model.action_space = observation_space, action_space
+                model.n_envs = saved["n_envs"]
+            model._setup_model()
+            restore_agent(model, saved)
+        if model.use_sde:  # its noise was drawn before the parameters were there
             model.policy.reset_noise()  # type: ignore[operator]
         model._check_loaded()
         return model
+
+    def set_parameters(
+        self,
+        load_path_or_dict: PathOrFile | dict[str, Any],
+        exact_match: bool = True,
+        device: th.device | str = "auto",
+    ) -> None:
+        """Take over networks and optimizers from state dicts, as SB3 does, or from a file of :meth:`save`.
+
+        :param exact_match: refuse what lacks a part; False takes what there is
+        :raises SavedFileError: if the file cannot be read or does not fit
+        """
+        if isinstance(load_path_or_dict, dict):
+            super().set_parameters(self._adapt_parameters(load_path_or_dict), exact_match, device)
+            return
+        path = _existing(load_path_or_dict)
+        saved = load_tree(path, kind=None)
+        with readable(path):
+            _restore_parameters(self, saved["parameters"], exact_match)
+
+    @classmethod
+    def _argument_names(cls) -> set[str]:
+        """Return the names of the arguments that a file holds: those of the constructors up to SB3's algorithm."""
+        names = {"policy_class"}
+        for base in cls.__mro__[: cls.__mro__.index(OffPolicyAlgorithm)]:
+            if "__init__" in vars(base):
+                parameters = inspect.signature(base).parameters.values()
+                names |= {p.name for p in parameters if p.kind is not p.VAR_KEYWORD}
+        return names - _NO_ARGUMENTS
 
     @classmethod
     def _check_spaces(cls, env: GymEnv, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
@@ -242,142 +167,134 @@ class SafeSaveMixin(BaseAlgorithm):
     def _check_loaded(self) -> None:
         """Look at an agent that was just loaded, and at its environment where it was given one."""
 
-    def set_parameters(
-        self,
-        load_path_or_dict: PathOrFile | dict[str, Any],
-        exact_match: bool = True,
-        device: th.device | str = "auto",
-        allow_pickle: bool = False,
-    ) -> None:
-        """As SB3's, where a path has to be that of a file without pickles, unless ``allow_pickle`` is True."""
-        if not isinstance(load_path_or_dict, dict):
-            load_path_or_dict = load_algorithm_file(load_path_or_dict, device, None, allow_pickle, load_data=False)[1]
-        super().set_parameters(self._adapt_parameters(load_path_or_dict), exact_match, device)
-
     def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:
         """Return the state dicts to take over from those given; an algorithm may leave its own in their place."""
         return params
 
 
 class SafePolicyMixin(BasePolicy):
-    """Makes an SB3 policy save to and load from files without pickle. Name it before the policy, and register it.
-
-    >>> from stable_baselines3.sac.policies import SACPolicy
-    >>> from sb3_said.files.registry import register_class
-    >>> @register_class
-    ... class SafePolicy(SafePolicyMixin, SACPolicy):
-    ...     pass
-    """
+    """Makes an SB3 policy save to and load from files without pickle. Name it before the policy."""
 
     def save(self, path: PathOrFile) -> None:
         """Write networks and constructor arguments, all that ``predict`` needs; optimizers are the algorithm's.
 
         :param path: where to write, as it is. Or a binary file object.
-        :raises ValueError: if a constructor argument is a function or an object of an unregistered class, or the
-            policy's own class is unregistered
+        :raises ValueError: if a constructor argument cannot be written without pickle
         """
         arguments = self._get_constructor_parameters()
-        if "lr_schedule" in arguments:  # a method in SB3's files too that only stands in: no policy learns by itself
-            arguments["lr_schedule"] = ConstantSchedule(0.0)
-        encoder = ObjectEncoder()
-        try:
-            root = {
-                "class": encoder.encode(type(self), "its class"),
-                "arguments": encoder.encode(arguments, "arguments"),
-                "state_dict": encoder.encode(self.state_dict(), "state_dict"),
-            }
-        except ValueError as error:
-            raise ValueError(
-                f"Cannot save this {type(self).__name__}: {error}. Functions and objects of unregistered classes cannot"
-                " be written without pickle; register a class of your own with"
-                " sb3_said.files.registry.register_class."
-            ) from error
-        write_file(path, "policy", root, encoder.blobs, {"policy": type(self).__name__})
+        arguments.pop("lr_schedule")  # the algorithm's
+        own_spaces = [space_as_data(arguments.pop(name)) for name in ("observation_space", "action_space")]
+        tree = {"arguments": as_data(arguments, "arguments"), "spaces": own_spaces, "state_dict": self.state_dict()}
+        save_tree(path, tree, kind=type(self).__name__)
 
     @classmethod
-    def load(
-        cls: type[SelfSafePolicy], path: PathOrFile, device: th.device | str = "auto", allow_pickle: bool = False
-    ) -> SelfSafePolicy:
+    def load(cls: type[SelfSafePolicy], path: PathOrFile, device: th.device | str = "auto") -> SelfSafePolicy:
         """Build a policy from a file, running no code from it.
 
         :param path: of the file, or a seekable binary file object
         :param device: where the policy computes
-        :param allow_pickle: also load files of SB3's own ``save``, which can run any code: only for files you trust
-        :raises ValueError: if the file is damaged, foreign, newer than this package, of another class of policy, names
-            an unregistered class, or holds a pickle and ``allow_pickle`` is False
+        :raises SavedFileError: if the file is damaged, foreign, forged, newer than this package, or of another class
         """
-        if allow_pickle and _holds_pickle(path):
-            return super().load(path, device)  # type: ignore[arg-type]
-        with explained_refusal("load"):
-            saved = read_file(path, "policy")
-        decoder = ObjectDecoder(saved.blobs)
+        saved = load_tree(path, cls.__name__)
         with readable(path):
-            saved_class = decoder.decode(saved.root["class"])
-            if saved_class is not cls:
-                name = saved_class.__name__
-                raise SavedFileError(f"it holds a {name}, where {cls.__name__} was expected: load it with {name}.load")
-            arguments = decoder.decode(saved.root["arguments"])
-            policy = cls(**arguments)
-            policy.load_state_dict(Decoder(saved.blobs).decode(saved.root["state_dict"]))
+            arguments = from_data(saved["arguments"])
+            policy = cls(*map(space_from_data, saved["spaces"]), ConstantSchedule(0.0), **arguments)
+            _check_tensors("state_dict", saved["state_dict"], policy.state_dict())
+            policy.load_state_dict(saved["state_dict"])
         policy.to(get_device(device))
         if arguments.get("use_sde"):  # its noise was drawn before the parameters were there
             policy.reset_noise()  # type: ignore[operator]
         return policy
 
 
-@contextlib.contextmanager
-def explained_refusal(method: str) -> Iterator[None]:
-    """Add to the refusal of a pickle why it is refused, and how to load the file all the same.
+def agent_state(model: SafeSaveMixin) -> dict[str, Any]:
+    """Return what learning has changed, as a tree; of optimizers only the state, as their settings are arguments."""
+    parameters = model.get_parameters()
+    return {
+        "counters": {name: getattr(model, name) for name in model.counters},
+        "parameters": {name: part["state"] if "param_groups" in part else part for name, part in parameters.items()},
+        "variables": {name: getattr(model, name).detach() for name in model._get_torch_save_params()[1]},
+    }
 
-    :param method: that takes ``allow_pickle``
+
+def restore_agent(model: SafeSaveMixin, saved: dict[str, Any]) -> None:
+    """Take over what :func:`agent_state` returned, each part once it is known to fit the model's own.
+
+    :raises SavedFileError: for parts of other names, shapes or types, or that are not finite
     """
-    try:
-        yield
-    except PickleRefusedError as error:
-        raise PickleRefusedError(
-            f"{error} Unpickling runs whatever code the file's author put there, so files with pickles, such as those"
-            " that Stable-Baselines3 itself saves, are refused. If you trust the author, use"
-            f" {method}(path, allow_pickle=True), and save again to get a file without pickles."
-        ) from error
+    _restore_counters(model, saved["counters"])
+    _restore_parameters(model, saved["parameters"])
+    own = {name: getattr(model, name).data for name in model._get_torch_save_params()[1]}
+    _check_tensors("variables", saved["variables"], own)
+    for name, value in own.items():
+        value.copy_(saved["variables"][name])
+
+
+def _restore_counters(model: SafeSaveMixin, saved: dict[str, Any]) -> None:
+    _check_names("counters", saved, model.counters)
+    for name in model.counters:
+        value, own = saved[name], getattr(model, name)
+        if isinstance(own, (int, float)):
+            fits = type(value) is type(own)
+        else:  # ages, where it has learned
+            fits = value is None or (type(value) is list and all(type(item) is int for item in value))
+        if not fits:
+            raise SavedFileError(f"its part 'counters' does not fit: {name} is {value!r:.50}")
+        setattr(model, name, value)
+
+
+def _restore_parameters(model: SafeSaveMixin, saved: dict[str, Any], exact: bool = True) -> None:
+    saved, own = model._adapt_parameters(saved), model.get_parameters()
+    _check_names("parameters", saved, own, exact)
+    for name, state in saved.items():
+        target = recursive_getattr(model, name)
+        if isinstance(target, th.optim.Optimizer):
+            owners = dict(enumerate(p for group in target.param_groups for p in group["params"]))
+            _check_names(name, state, owners, exact=False)
+            for index, values in state.items():
+                _check_optimizer_state(f"{name}[{index}]", values, owners[index].shape)
+            target.load_state_dict({**own[name], "state": state})
+        else:
+            _check_tensors(name, state, own[name], exact)
+            target.load_state_dict(state, strict=exact)
+
+
+def _check_optimizer_state(where: str, state: dict[str, Any], shape: th.Size) -> None:
+    for name, value in state.items():  # as large as its parameter or, as the step, a number for all of it
+        fits = isinstance(value, (int, float, type(None)))
+        if isinstance(value, th.Tensor):
+            fits = th.broadcast_shapes(value.shape, shape) == shape and bool(th.isfinite(value).all())
+        if not fits:
+            raise SavedFileError(f"its part {where!r} does not fit: {name} is not of {tuple(shape)}, or not finite")
+
+
+def _check_tensors(where: str, saved: dict[str, Any], own: dict[str, Any], exact: bool = True) -> None:
+    _check_names(where, saved, own, exact)
+    for name, value in saved.items():
+        shape, dtype = own[name].shape, own[name].dtype
+        if not isinstance(value, th.Tensor) or (value.shape, value.dtype) != (shape, dtype):
+            given = (value.dtype, tuple(value.shape)) if isinstance(value, th.Tensor) else value
+            raise SavedFileError(
+                f"its part {where!r} does not fit: {name} is {given!s:.60}, expected {dtype, tuple(shape)}"
+            )
+        if not th.isfinite(value).all():
+            raise SavedFileError(f"its part {where!r} does not fit: {name} has NaN or infinite entries")
+
+
+def _check_names(where: str, saved: Collection[Any], own: Collection[Any], exact: bool = True) -> None:
+    lacking, unknown = [x for x in own if x not in saved], [x for x in saved if x not in own]
+    if unknown or (exact and lacking):
+        raise SavedFileError(f"its part {where!r} does not fit: it lacks {lacking[:5]} and has unknown {unknown[:5]}")
 
 
 def _existing(path: PathOrFile) -> PathOrFile:
     """Add ``.zip`` where the path alone is no file, as SB3 does."""
-    if not isinstance(path, (str, os.PathLike)) or os.path.isfile(path):
-        return path
-    if os.path.isfile(f"{os.fspath(path)}.zip"):
-        return f"{os.fspath(path)}.zip"
-    raise FileNotFoundError(f"There is no file '{os.fspath(path)}' and no '{os.fspath(path)}.zip'.")
+    if isinstance(path, (str, os.PathLike)) and not os.path.isfile(path):
+        path = f"{os.fspath(path)}.zip"
+        if not os.path.isfile(path):
+            raise FileNotFoundError(f"There is no file '{path[:-4]}' and no '{path}'.")
+    return path
 
 
-def _holds_pickle(path: PathOrFile) -> bool:
-    try:
-        load_metadata(path)
-    except PickleRefusedError:
-        return True
-    return False
-
-
-def _check_data(data: dict[str, Any], kwargs: dict[str, Any]) -> None:
-    """:raises ValueError: if attributes from a file do not suffice to build an agent, or contradict the given ones"""
-    if absent := [name for name in ("policy_class", "observation_space", "action_space") if name not in data]:
-        raise ValueError(
-            f"The file lacks {', '.join(absent)}, without which no agent can be built. Give them as"
-            " load(..., custom_objects={name: value})."
-        )
-    kinds = {
-        "policy_class": type,
-        "observation_space": spaces.Space,
-        "action_space": spaces.Space,
-        "policy_kwargs": dict,
-    }
-    for name, kind in kinds.items():
-        if not isinstance(data.get(name, kwargs.get(name)), (kind, type(None))):
-            raise ValueError(f"The file's {name} is {data[name]!r:.100}, not a {kind.__name__}: it has been damaged.")
-    stored = data.get("policy_kwargs", {})
-    stored.pop("device", None)
-    if "policy_kwargs" in data and kwargs.get("policy_kwargs", stored) != stored:
-        raise ValueError(
-            f"The given policy_kwargs {kwargs['policy_kwargs']} differ from {stored} in the file, which the saved"
-            " networks were built with. Leave them out of the call."
-        )
+def _advice(names: Collection[str]) -> str:
+    return f"To supply them, use load(..., custom_objects={{{', '.join(f'{name!r}: ...' for name in names)}}})."

@@ -20,12 +20,11 @@ ABANDONED_AFTER = 600.0  # seconds since a write's last byte: a living one is ne
 def replacing(target: PathOrFile) -> Iterator[IO[bytes]]:
     """Write beside the target and swap at the end: a crash leaves the old file, never half a file.
 
-    What a write that was killed left beside the target is removed once it is ABANDONED_AFTER old. Several processes may
-    write the same target at a time: the last to finish wins.
+    A write removes what killed ones left beside its target, once it is ``ABANDONED_AFTER`` old. Several processes may
+    write one target at a time: the last to finish wins.
 
-    :param target: where to write; missing folders are made. A device or a pipe, such as /dev/stdout, is written to and
-        stays. Or a binary file object, which is given back as it is.
-    :return: the binary file to write to
+    :param target: where to write; missing folders are made. A device or a pipe is written to and stays, and a binary
+        file object is given back as it is.
     :raises ValueError: if the target is a folder
     """
     if not isinstance(target, (str, os.PathLike)):

@@ -19,7 +19,8 @@ from stable_baselines3.common.type_aliases import (
 )
 
 from sb3_said.delays.space import ages_of, check_spaces, written_ages
-from sb3_said.files.agents import PickleRefusedError, SafeSaveMixin, explained_refusal, load_tree, save_tree
+from sb3_said.files.agents import SafeSaveMixin
+from sb3_said.files.archive import load_tree, save_tree
 from sb3_said.replay.buffer import DelayedReplayBuffer
 from sb3_said.sac.policies import DelayedSACPolicy
 
@@ -60,6 +61,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
         "MlpPolicy": DelayedSACPolicy,
         "MultiInputPolicy": DelayedSACPolicy,
     }
+    counters = (*SafeSaveMixin.counters, "trained_ages")
+    own_classes = (DelayedReplayBuffer,)
     policy: DelayedSACPolicy
     replay_buffer: DelayedReplayBuffer
 
@@ -215,26 +218,11 @@ class DelayedSAC(SafeSaveMixin, SAC):
         """
         save_tree(path, self.replay_buffer.state_dict())  # type: ignore[arg-type]
 
-    def load_replay_buffer(
-        self,
-        path: str | pathlib.Path | io.BufferedIOBase,
-        truncate_last_traj: bool = True,
-        allow_pickle: bool = False,
-    ) -> None:
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """Read what ``save_replay_buffer`` wrote into this agent's buffer, running no code from the file.
 
         :param path: of the file, or a binary file object
         :param truncate_last_traj: of SB3's ``HerReplayBuffer``, without effect here
-        :param allow_pickle: also load files of SB3's own method, which can run any code: only for files you trust
-        :raises ValueError: when the file is no replay, was made with another task, ``buffer_size`` or ``n_envs``, or
-            holds a pickle
+        :raises ValueError: when the file is no replay, or was made with another task, ``buffer_size`` or ``n_envs``
         """
-        try:
-            with explained_refusal("load_replay_buffer"):
-                state = load_tree(path)  # type: ignore[arg-type]
-        except PickleRefusedError:
-            if not allow_pickle:
-                raise
-            super().load_replay_buffer(path, truncate_last_traj)
-            return
-        self.replay_buffer.load_state_dict(state)
+        self.replay_buffer.load_state_dict(load_tree(path))  # type: ignore[arg-type]

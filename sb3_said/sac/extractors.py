@@ -6,10 +6,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
-from sb3_said.files.registry import register_class
 
-
-@register_class
 class StateAugmentedExtractor(BaseFeaturesExtractor):
     """Concatenate [delayed observation, actions sent since, age / D], which make the process Markov (Theorem 2.1).
 
@@ -32,7 +29,6 @@ class StateAugmentedExtractor(BaseFeaturesExtractor):
         return th.cat([observations["observation"], history.flatten(1), age / max(self.max_delay, 1)], dim=1)
 
 
-@register_class
 class KeyExtractor(BaseFeaturesExtractor):
     """Read one key of a dict observation and nothing else.
 

@@ -14,11 +14,9 @@ from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from sb3_said.delays.space import UNDELAYED, check_spaces
 from sb3_said.files.agents import SafePolicyMixin
-from sb3_said.files.registry import register_class
 from sb3_said.sac.extractors import KeyExtractor, StateAugmentedExtractor
 
 
-@register_class
 class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
     """SAC's policy for delayed observations; for a plain 1-D Box it computes what SB3's ``SACPolicy`` does.
 

@@ -15,7 +15,6 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_said.delays.space import UNDELAYED, check_spaces, has_state_history
-from sb3_said.files.registry import register_class
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner.graphs import EAGER_CALLS
 from sb3_said.sac.policies import DelayedSACPolicy
@@ -23,7 +22,6 @@ from sb3_said.sac.policies import DelayedSACPolicy
 Answer = Literal["planner", "expert"]
 
 
-@register_class
 class SAIDPolicy(DelayedSACPolicy):
     """The expert's policy with an inpainting planner on top.
 

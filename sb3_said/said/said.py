@@ -55,6 +55,7 @@ class SAID(DelayedSAC):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": SAIDPolicy, "MultiInputPolicy": SAIDPolicy}
+    counters = (*DelayedSAC.counters, "_planner_trained_at")
     policy: SAIDPolicy
 
     def __init__(

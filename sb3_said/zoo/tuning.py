@@ -10,7 +10,7 @@ import torch as th
 from filelock import FileLock
 from stable_baselines3.common.logger import Logger, make_output_format
 
-from sb3_said.files.agents import load_tree, save_tree
+from sb3_said.files.archive import load_tree, save_tree
 from sb3_said.planner import InpaintingPlanner
 from sb3_said.planner.config import SAMPLING_SETTINGS, weight_settings
 from sb3_said.said.callbacks import PLANNER_CHECKPOINT_NAME, PlannerTrainingCallback

@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_said.delays import UniformDelay
 from sb3_said.delays.space import UNDELAYED
-from sb3_said.files.agents import load_tree, save_tree
+from sb3_said.files.archive import load_tree, save_tree
 from sb3_said.replay.buffer import DelayedReplayBuffer
 
 

@@ -418,10 +418,8 @@ def test_replay_is_saved_without_pickle(tmp_path):
         make(delayed(), buffer_size=20).load_replay_buffer(tmp_path / "replay.pkl")
 
     save_to_pkl(tmp_path / "pickled.pkl", model.replay_buffer)
-    with pytest.raises(ValueError, match="allow_pickle=True"):
+    with pytest.raises(ValueError, match="holds a pickle"):
         make().load_replay_buffer(tmp_path / "pickled.pkl")
-    (opted_in := make()).load_replay_buffer(tmp_path / "pickled.pkl", allow_pickle=True)
-    assert opted_in.replay_buffer.size() == 30
 
 
 # ---------------------------------------------------------------------------------------------------- refusals

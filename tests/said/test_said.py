@@ -161,23 +161,21 @@ def test_every_argument_has_a_default_and_is_an_attribute():
 
 def test_a_saved_agent_is_json_and_tensors(saved):
     with zipfile.ZipFile(saved) as archive:
-        assert sorted(archive.namelist()) == ["metadata.json", "tensors.safetensors", "tree.json"]
+        assert {name.lstrip("0123456789") for name in archive.namelist()} == {"tree.json", ".npy"}
         content = b"".join(archive.read(name) for name in archive.namelist())
     assert b":serialized:" not in content and b"cloudpickle" not in content
     assert not content.startswith(b"\x80")
 
 
-def test_a_file_with_pickles_needs_an_opt_in(trained, tmp_path):
+def test_a_file_with_pickles_is_refused(trained, tmp_path):
     BaseAlgorithm.save(trained, tmp_path / "pickled")  # SB3's own
-    with pytest.raises(ValueError, match=r"runs whatever code.*allow_pickle=True"):
+    with pytest.raises(ValueError, match=r"runs whatever code.*get_parameters\(\)"):
         SAID.load(tmp_path / "pickled")
-    loaded = SAID.load(tmp_path / "pickled", device="cpu", allow_pickle=True)
-    assert np.array_equal(answer(loaded, observe()), answer(trained, observe()))
 
 
 def test_another_algorithms_file_is_refused(tmp_path):
     make(cls=DelayedSAC).save(tmp_path / "sac")
-    with pytest.raises(ValueError, match="SAID needs a SAIDPolicy, got DelayedSACPolicy"):
+    with pytest.raises(ValueError, match="kind 'DelayedSAC', where 'SAID' was expected"):
         SAID.load(tmp_path / "sac")
 
 

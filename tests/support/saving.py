@@ -4,16 +4,11 @@ import zipfile
 
 import numpy as np
 import torch as th
-from stable_baselines3 import SAC
 
-from sb3_said.files.agents import SafeSaveMixin
-
-
-class SafeSAC(SafeSaveMixin, SAC):
-    pass
+from sb3_said import DelayedSAC
 
 
-def make_sac(env="Pendulum-v1", policy="MlpPolicy", cls=SafeSAC, **kwargs):
+def make_sac(env="Pendulum-v1", policy="MlpPolicy", cls=DelayedSAC, **kwargs):
     arguments = {"learning_starts": 10, "batch_size": 8, "buffer_size": 200, "seed": 0, "device": "cpu"}
     return cls(policy, env, **(arguments | {"policy_kwargs": {"net_arch": [8]}} | kwargs))
 

@@ -16,7 +16,7 @@ import pytest
 import yaml
 
 from sb3_said import SAID, DelayedSAC, PlannerConfig
-from sb3_said.files.agents import load_tree
+from sb3_said.files.archive import load_tree
 from sb3_said.zoo import manager as zoo
 from sb3_said.zoo import train
 from sb3_said.zoo.runs import load_run

@@ -20,7 +20,7 @@ from trained_run import config_of, read_by_train, train_run, train_said
 
 from sb3_said import SAID, PlannerConfig
 from sb3_said.evaluation import rollout
-from sb3_said.files.agents import load_tree
+from sb3_said.files.archive import load_tree
 from sb3_said.files.checkpoint import CHECKPOINT_NAME
 from sb3_said.zoo import tune
 from sb3_said.zoo.manager import read_delay

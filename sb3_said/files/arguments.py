@@ -1,0 +1,99 @@
+"""Constructor arguments and spaces as plain data, and back: the few named things that an agent's file can hold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
+from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.common.type_aliases import TrainFreq
+from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
+from torch.nn.modules import activation
+
+from sb3_said.files.archive import SavedFileError
+
+# Tables, and no look-up by a stranger's name: nothing is imported or found because a file says so.
+_CLASSES: dict[str, type] = {
+    **{f"torch.nn.{name}": getattr(activation, name) for name in activation.__all__},
+    **{f"torch.optim.{name}": cls for name, cls in vars(th.optim).items() if type(cls) is type},
+    "FlattenExtractor": FlattenExtractor,
+}
+_NAMES = {cls: name for name, cls in _CLASSES.items()}
+# Constructor arguments, by exact class: a subclass would come back as its parent.
+_PARTS: dict[type, Callable[[Any], tuple[Any, ...]]] = {
+    ConstantSchedule: lambda s: (s.val,),
+    FloatSchedule: lambda s: (s.value_schedule,),
+    LinearSchedule: lambda s: (s.start, s.end, s.end_fraction),
+    NormalActionNoise: lambda n: (n._mu, n._sigma, np.dtype(n._dtype).str),
+    OrnsteinUhlenbeckActionNoise: lambda n: (n._mu, n._sigma, n._theta, n._dt, n.initial_noise, np.dtype(n._dtype).str),
+}
+_BUILDERS = {cls.__name__: cls for cls in _PARTS}
+
+
+def as_data(value: Any, where: str) -> Any:
+    """Return an argument as a tree for :func:`~sb3_said.files.archive.save_tree`.
+
+    :param where: the argument's name, for the error
+    :raises ValueError: for a function, or an object or class that is not in the tables of this module
+    """
+    cls = type(value)
+    if cls is dict:
+        return {key: as_data(item, f"{where}[{key!r}]") for key, item in value.items()}
+    if cls in (list, tuple):
+        return cls(as_data(item, f"{where}[{index}]") for index, item in enumerate(value))
+    if cls in (type(None), bool, int, float, str) or isinstance(value, (np.ndarray, np.generic, th.Tensor)):
+        return value
+    if cls is TrainFreq:
+        return value.frequency, value.unit.value
+    if cls is VectorizedActionNoise:  # learn() makes another, for as many environments as there are then
+        return as_data(value.base_noise, where)
+    if cls.__name__ == "SimpleLinearSchedule" and cls.__module__ == "rl_zoo3.utils":
+        value, cls = LinearSchedule(value.initial_value, 0.0, 1.0), LinearSchedule
+    if cls in _PARTS:
+        return {"@": [cls.__name__, *(as_data(part, where) for part in _PARTS[cls](value))]}
+    if isinstance(value, type) and value in _NAMES:
+        return {"@": [_NAMES[value]]}
+    raise ValueError(f"{where} is {value!r:.100}, which cannot be written without pickle.")
+
+
+def from_data(node: Any) -> Any:
+    """Return the argument that :func:`as_data` was given.
+
+    :raises SavedFileError: for a name that is not in the tables of this module
+    """
+    if isinstance(node, (list, tuple)):
+        return type(node)(from_data(item) for item in node)
+    if not isinstance(node, dict):
+        return node
+    if "@" not in node:
+        return {key: from_data(item) for key, item in node.items()}
+    name, *parts = node["@"]
+    if name in _BUILDERS:
+        return _BUILDERS[name](*map(from_data, parts))
+    if name not in _CLASSES or parts:
+        raise SavedFileError(f"it names {name!r}, which no file of sb3_said does; loading builds nothing of that name")
+    return _CLASSES[name]
+
+
+def space_as_data(space: spaces.Space[Any]) -> Any:
+    """Return [low, high] of a Box, or a dict of these.
+
+    :raises ValueError: for other spaces
+    """
+    if isinstance(space, spaces.Dict):
+        return {key: space_as_data(part) for key, part in space.items()}
+    if not isinstance(space, spaces.Box):
+        raise ValueError(f"Only Box spaces and Dict spaces of them can be saved, got {space}.")
+    return [space.low, space.high]
+
+
+def space_from_data(node: Any) -> spaces.Space[Any]:
+    """Return the space that :func:`space_as_data` was given."""
+    if isinstance(node, dict):  # pairs: a dict would be sorted, and the order of the keys is that of a network's inputs
+        return spaces.Dict([(key, space_from_data(part)) for key, part in node.items()])
+    low, high = node
+    return spaces.Box(low, high, dtype=low.dtype)
