@@ -101,7 +101,7 @@ class OwnSchedule(LinearSchedule):
 
 
 @pytest.mark.parametrize(
-    "value", [lambda x: x, OwnSchedule(1, 0, 1), OwnPolicy, os.system, th.device("cpu"), {1, 2}, SACPolicy], ids=str
+    "value", [lambda x: x, OwnSchedule(1, 0, 1), OwnPolicy, os.system, th.device("cpu"), {1, 2}, SACPolicy]
 )
 def test_what_has_no_name_is_refused_with_its_place(value):
     with pytest.raises(ValueError, match=r"^kwargs\['a'\]\[1\] is .* cannot be written without pickle"):
