@@ -110,7 +110,7 @@ class InpaintingPlanner(nn.Module):
         check_finite("actions", actions, (len(states), self.act_dim))
         self.normalizer.fit(states, actions)
         if windows is not None:
-            self.normalizer.fit_moves(Windows(*(part.to(self.device) for part in windows)))
+            self.normalizer.fit_moves(windows.to(self.device))
 
     def loss(
         self,

@@ -151,7 +151,7 @@ class PlannerTrainer:
         self._set_rate(self.optimizer, rate)
         self._set_rate(self.yardstick_optimizer, rate * YARDSTICK_LEARNING_RATE / self.config.learning_rate)
         (losses,) = self._descend() if self._recorded is None else self._recorded()  # (2,)
-        with th.no_grad():  # not recorded, as a replay would not tell the planner's sampling cache of new weights
+        with th.no_grad():  # not recorded: the decay changes from update to update
             th._foreach_lerp_(self._averaged, self._online, 1.0 - ema_decay(self.n_updates, self.config))
             self._loss_sums += losses
             is_first_bad = ~losses[0].isfinite() & (self._bad_update < 0)
@@ -245,11 +245,9 @@ class PlannerTrainer:
             {
                 "settings": self._settings,
                 "n_updates": self.n_updates,
-                "planner": dict(self.planner.state_dict()),
-                "online": dict(self.online.state_dict()),
-                "yardstick": dict(self.yardstick.state_dict()),
-                "optimizer": _optimizer_state(self.optimizer),
-                "yardstick_optimizer": _optimizer_state(self.yardstick_optimizer),
+                **{name: dict(module.state_dict()) for name, module in self._modules().items()},
+                # Of optimizers the state alone: their groups hold nothing but settings
+                **{name: optimizer.state_dict()["state"] for name, optimizer in self._optimizers().items()},
                 "generator": self.generator.get_state(),
                 "loss_sums": self._loss_sums,
                 "n_losses": self._n_losses,
@@ -271,17 +269,22 @@ class PlannerTrainer:
             )
         state = copy.deepcopy(state)
         self.n_updates = state["n_updates"]
-        self.planner.load_state_dict(state["planner"])
-        self.online.load_state_dict(state["online"])
-        self.yardstick.load_state_dict(state["yardstick"])
-        _load_optimizer_state(self.optimizer, state["optimizer"])
-        _load_optimizer_state(self.yardstick_optimizer, state["yardstick_optimizer"])
+        for name, module in self._modules().items():
+            module.load_state_dict(state[name])
+        for name, optimizer in self._optimizers().items():
+            optimizer.load_state_dict({**optimizer.state_dict(), "state": state[name]})
         self.generator.set_state(state["generator"].cpu())
         self._loss_sums.copy_(state["loss_sums"])
         self._n_losses = state["n_losses"]
         self._bad_update.fill_(-1)
         if self._recorded is not None:
             self._recorded.forget()  # it writes to the optimizer state that was replaced
+
+    def _modules(self) -> dict[str, th.nn.Module]:
+        return {"planner": self.planner, "online": self.online, "yardstick": self.yardstick}
+
+    def _optimizers(self) -> dict[str, th.optim.Optimizer]:
+        return {"optimizer": self.optimizer, "yardstick_optimizer": self.yardstick_optimizer}
 
     def _rate(self, rate: float) -> float | th.Tensor:
         """Return a learning rate as the optimizers take it: on a GPU a tensor, so that a recorded update reads it."""
@@ -303,9 +306,6 @@ class PlannerTrainer:
                 f"infinite values; else lower learning_rate ({self.config.learning_rate}) or lengthen warmup_steps "
                 f"({self.config.warmup_steps})."
             )
-
-    def _to_device(self, windows: Windows) -> Windows:
-        return Windows(*(part.to(self.device, non_blocking=True) for part in windows))
 
     def _yardstick_batch(
         self, windows: Windows, delay: th.Tensor
@@ -330,15 +330,5 @@ class PlannerTrainer:
             long_enough = th.nonzero(source.remaining > d)[:, 0]  # index d, the decision, is in the same episode
             starts = long_enough[th.randperm(len(long_enough), generator=generator)[:HELD_OUT_WINDOWS]]
             if len(starts):
-                held_out[d] = self._to_device(source.gather(starts, self.planner.window_length))
+                held_out[d] = source.gather(starts, self.planner.window_length).to(self.device)
         return held_out
-
-
-def _optimizer_state(optimizer: th.optim.Optimizer) -> dict[str, Any]:
-    # The groups are left out: they hold nothing but settings, and tuples. Names are strings, for JSON.
-    return {str(index): state for index, state in optimizer.state_dict()["state"].items()}
-
-
-def _load_optimizer_state(optimizer: th.optim.Optimizer, state: dict[str, Any]) -> None:
-    groups = optimizer.state_dict()["param_groups"]
-    optimizer.load_state_dict({"state": {int(index): part for index, part in state.items()}, "param_groups": groups})

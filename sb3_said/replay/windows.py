@@ -19,6 +19,10 @@ class Windows(NamedTuple):
     valid: th.Tensor  # (B, L) bool; a prefix of each row, never empty
     values: th.Tensor  # (B,) float32, what the source says of the first state
 
+    def to(self, device: th.device | str) -> Windows:
+        """Return these windows on a device."""
+        return Windows(*(part.to(device) for part in self))
+
 
 @dataclass(frozen=True)
 class WindowSource:

@@ -41,7 +41,7 @@ def leaves(tree, path=""):
     """Walk a state dict, refusing what could not be written without pickle."""
     if isinstance(tree, dict):
         for key, value in tree.items():
-            assert isinstance(key, str), path
+            assert isinstance(key, (str, int)), path
             yield from leaves(value, f"{path}/{key}")
     elif isinstance(tree, list):
         for i, value in enumerate(tree):
