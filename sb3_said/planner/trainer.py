@@ -170,14 +170,8 @@ class PlannerTrainer:
         self.optimizer.zero_grad()
         self.yardstick_optimizer.zero_grad()
         windows = self.source.sample(config.batch_size, self.planner.window_length, self.generator)
-        delay = draw_delays(
-            config.batch_size,
-            self.planner.max_delay,
-            config.mask,
-            config.mask_end_probability,
-            self.generator,
-            self.device,
-        )  # (B,)
+        mask = config.mask, config.mask_end_probability
+        delay = draw_delays(config.batch_size, self.planner.max_delay, *mask, self.generator, self.device)  # (B,)
         weight = window_weight(windows.values, config.weight_factor)  # (B,)
         loss = self.online.loss(windows, delay, weight, self.generator)
         loss.backward()
