@@ -11,20 +11,20 @@ from typing import Any
 
 import gymnasium as gym
 
-from sb3_said.evaluation import rollout
-from sb3_said.zoo.manager import add_delay, read_delay
+from sb3_said.zoo.delays import read_delay
+from sb3_said.zoo.evaluate import add_run
 from sb3_said.zoo.runs import ANSWERS, answering, load_run
 
 EPILOG = """\
 examples:
   # three episodes in a window
-  python scripts/enjoy.py logs/said/Hopper-v5-delay4_1 --episodes 3
+  sb3-said enjoy logs/said/Hopper-v5-delay4_1 --episodes 3
 
   # a video at real speed, on a machine without a display
-  python scripts/enjoy.py logs/said/Hopper-v5-delay4_1 --record hopper.mp4
+  sb3-said enjoy logs/said/Hopper-v5-delay4_1 --record hopper.mp4
 
   # the expert from the same starts, as a GIF
-  python scripts/enjoy.py logs/said/Hopper-v5-delay4_1 --answer expert --record hopper_expert.gif
+  sb3-said enjoy logs/said/Hopper-v5-delay4_1 --answer expert --record hopper_expert.gif
 
 Without a display, MuJoCo draws through EGL (Debian, Ubuntu: apt-get install libegl1 libgl1-mesa-dri), or in software
 with MUJOCO_GL=osmesa (libosmesa6). Videos need the extra sb3_said[video].
@@ -36,18 +36,13 @@ def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("run", metavar="RUN_OR_ZIP", help="run folder of a training, or an agent's .zip")
+    add_run(parser)
     parser.add_argument("--record", type=Path, metavar="FILE", help="write a video (.mp4 or .gif) instead of a window")
-    parser.add_argument("--fps", type=int, default=25, help="frames a second of the video; it plays in real time, "
-                        "by leaving out steps (default: 25)")  # fmt: skip
+    parser.add_argument(
+        "--fps", type=int, default=25, help="frames a second; the video skips steps to play in real time (default: 25)"
+    )
     parser.add_argument("--episodes", type=int, default=1, help="whole episodes (default: 1)")
-    parser.add_argument("--seed", type=int, default=10_000, help="reset seed of the first episode (default: 10000)")
     parser.add_argument("--answer", choices=ANSWERS, help="who acts in a SAID agent (default: the agent)")
-    parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the best")
-    parser.add_argument("--algo", help="algorithm of a .zip without its run folder")
-    parser.add_argument("--env", help="task to play (default: the trained one)")
-    add_delay(parser, default="the trained one")
-    parser.add_argument("--device", default="auto", help="torch device (default: auto)")
     return parser
 
 
@@ -165,13 +160,10 @@ def main(argv: list[str] | None = None) -> None:
     video = None if args.record is None else Video(args.record, args.fps)
     try:
         with context:
-            rollout(
-                run.model,
-                run.make_env,
+            run.play(
                 args.episodes,
                 args.seed,
                 deterministic=not args.stochastic,
-                normalize=run.normalize,
                 on_step=None if video is None else video.on_step,
                 on_episode=lambda i, ret, length: print(f"seed {args.seed + i}: return {ret:,.1f} in {length} steps"),
             )

@@ -25,9 +25,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_said import DelayedSAC
 from sb3_said.delays import DelayProcess, FixedDelay
 from sb3_said.delays.space import ages_of, has_state_history
-from sb3_said.evaluation.rollout import Observation
+from sb3_said.evaluation.rollout import Observation, Rollout, rollout
 from sb3_said.said.policies import Answer
-from sb3_said.zoo.manager import ALGOS, WRAPPER, Delay, largest_delay
+from sb3_said.zoo.delays import Delay, largest_delay
+from sb3_said.zoo.manager import ALGOS, WRAPPER
 
 ANSWERS = get_args(Answer)
 
@@ -45,6 +46,10 @@ class LoadedRun:
     """of the run, for results"""
     info: dict[str, Any]
     """what was loaded, in JSON types: algo, env, delay, file, trained_steps"""
+
+    def play(self, n_episodes: int, seed: int, n_envs: int = 1, **kwargs: Any) -> Rollout:
+        """Play whole episodes, see :func:`~sb3_said.evaluation.rollout`."""
+        return rollout(self.model, self.make_env, n_episodes, seed, n_envs, normalize=self.normalize, **kwargs)
 
 
 def load_run(
@@ -70,9 +75,9 @@ def load_run(
     :raises ValueError: when the files do not say what to load, or the agent does not fit the task
     """
     file, params = _find(Path(path))
-    hyperparams, args = _read_params(params)
+    hyperparams, args = read_params(params)
     algo = algo or args.get("algo")
-    env_id = env_id or getattr(args.get("env"), "gym_id", args.get("env"))
+    env_id = env_id or args.get("env")
     if algo not in ALGOS:
         raise ValueError(f"The algorithm of {file} is not known ({algo}): give --algo, one of {', '.join(ALGOS)}.")
     if env_id is None:
@@ -149,13 +154,19 @@ def origin(run: LoadedRun) -> dict[str, Any]:
     """Say what a reader needs to judge and repeat the numbers: command, date, machine, versions."""
     packages = ("sb3_said", "stable_baselines3", "torch", "gymnasium", "mujoco", "numpy")
     return {
-        "command": shlex.join(["python", *sys.argv]),
+        "command": command_line(),
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} CPU cores",
         "device": str(run.model.device),
         "torch_threads": th.get_num_threads(),
         "versions": {"python": platform.python_version(), **{package: version_of(package) for package in packages}},
     }
+
+
+def command_line() -> str:
+    """Return what was typed."""
+    program = sys.argv[0] if sys.argv[0].startswith("sb3-said ") else f"python {shlex.quote(sys.argv[0])}"
+    return f"{program} {shlex.join(sys.argv[1:])}"
 
 
 def version_of(package: str) -> str:
@@ -185,14 +196,18 @@ def _find(path: Path) -> tuple[Path, Path | None]:
     raise ValueError(f"{path} has no finished agent: neither {candidates[0].name} nor {candidates[1].name}.")
 
 
-def _read_params(params: Path | None) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return a run's hyper-parameters and command-line arguments; empty without a run folder."""
+def read_params(params: Path | None) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return a run's hyper-parameters and command-line arguments from the folder of its YAML; empty without one.
+
+    The YAML can run code: read only that of runs that you trust.
+    """
     if params is None:
         return {}, {}
     hyperparams, _ = get_saved_hyperparams(str(params), test_mode=True)
     # rl_zoo3 writes Python objects into this file, so that no safe loader reads it.
-    args = yaml.load((params / "args.yml").read_text(), Loader=yaml.UnsafeLoader)
-    return dict(hyperparams), dict(args)
+    args = dict(yaml.load((params / "args.yml").read_text(), Loader=yaml.UnsafeLoader))
+    args["env"] = getattr(args.get("env"), "gym_id", args.get("env"))
+    return dict(hyperparams), args
 
 
 def _with_delay(wrappers: list[Any], delay: Delay, model: BaseAlgorithm) -> list[Any]:
