@@ -34,7 +34,8 @@ def main() -> None:
     try:
         command = importlib.import_module(f"sb3_said.zoo.{name.replace('-', '_')}")
     except ModuleNotFoundError as error:
-        if (error.name or "").startswith("sb3_said"):
+        missing = str(error.name).partition(".")[0]
+        if missing == "sb3_said":
             raise
-        sys.exit(f'{error.name} is missing, which sb3-said {name} needs: pip install "sb3_said[zoo]"')
+        sys.exit(f'{missing} is missing, which sb3-said {name} needs: pip install "sb3_said[zoo]"')
     command.main()

@@ -15,7 +15,6 @@ from sb3_said.files.archive import load_tree, save_tree
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.said.callbacks import PLANNER_CHECKPOINT_NAME, PlannerTrainingCallback
-from sb3_said.said.policies import SAIDPolicy
 from sb3_said.said.said import SAID
 from sb3_said.zoo.manager import log_suffix
 
@@ -101,7 +100,7 @@ class DepthPlanners:
     def _make_planner(self, depth: int) -> None:
         with th.random.fork_rng(devices=[]):  # the same weights to begin with, whichever worker trains them
             th.manual_seed(self.model.seed or 0)
-            make_planner(self.model.policy, replace(self.config, depth=depth))
+            make_planner(self.model, replace(self.config, depth=depth))
 
     def _train(self, depth: int) -> None:
         planner = self._own
@@ -151,12 +150,13 @@ def check_same(what: str, before: dict[str, Any], now: dict[str, Any], advice: s
         raise ValueError(f"{what} with other settings: {changes}. {advice}")
 
 
-def make_planner(policy: SAIDPolicy, config: PlannerConfig) -> None:
-    """Give a policy a new planner. MERGE: the call above becomes ``self.model.policy.make_planner(config)``."""
-    old = policy.planner
+def make_planner(model: SAID, config: PlannerConfig) -> None:
+    """Give an agent a new planner. MERGE: the call becomes ``self.model.policy.make_planner(config)``."""
+    policy, old = model.policy, model.policy.planner
     policy.planner = InpaintingPlanner(old.obs_dim, old.act_dim, old.max_delay, config).to(old.device)
     policy.planner.requires_grad_(False).train(False)
     policy.planner_updates.zero_()
+    model.planner_kwargs = policy.planner_kwargs = config.to_dict()
 
 
 def train_planner(model: SAID, gradient_steps: int, folder: Path, progress_bar: bool) -> None:
@@ -164,4 +164,3 @@ def train_planner(model: SAID, gradient_steps: int, folder: Path, progress_bar: 
     callback = PlannerTrainingCallback(folder=folder, progress_bar=progress_bar)
     callback.init_callback(model)
     callback.train_planner(gradient_steps)
-    model.planner_kwargs = model.policy.planner_kwargs = model.policy.planner.config.to_dict()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import warnings
 from collections import OrderedDict
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from small_run import ENV, write_run
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.evaluation import Summary
 from sb3_said.zoo import evaluate, over_delays
+from sb3_said.zoo.cells import Cell, average
 from sb3_said.zoo.runs import load_run
 
 
@@ -50,7 +50,7 @@ def count_plays(monkeypatch: pytest.MonkeyPatch, stop_after: int | None = None) 
     played: list[tuple[str, Any]] = []
     original = over_delays.play
 
-    def counted(cell: over_delays.Cell, *how: Any) -> Summary:
+    def counted(cell: Cell, *how: Any) -> Summary:
         if len(played) == stop_after:
             raise KeyboardInterrupt
         played.append((cell.agent, cell.delay))
@@ -221,12 +221,16 @@ def test_only_the_warning_of_another_delay_is_silent(sadr: Path, monkeypatch: py
         over_delays.open_run(str(sadr), None, None, 0, "cpu")
 
 
-def test_a_planner_of_one_delay_plays_no_other(said: Path) -> None:
+def test_a_planner_that_cannot_answer_at_a_delay_does_not_play_it(said: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model: Any = load_run(said, device="cpu").model
-    planner = model.policy.planner
-    planner.config = replace(planner.config, mask="fixed")
+
+    def check_ages(ages: list[int]) -> None:
+        if ages != [2]:
+            raise ValueError(f"It does not know {ages}.")
+
+    monkeypatch.setattr(model.policy.planner, "check_ages", check_ages, raising=False)
     found = {delay: over_delays.obstacle(model, "planner", delay) for delay in (1, 2, "UniformDelay(0, 2)")}
-    assert found == {delay: None if delay == 2 else "its planner was trained for delay 2 alone" for delay in found}
+    assert found == {1: "It does not know [1]", 2: None, "UniformDelay(0, 2)": "It does not know [0, 1, 2]"}
     assert over_delays.obstacle(model, "expert", 1) is None
 
 
@@ -234,9 +238,9 @@ def test_an_average_pairs_episodes_of_one_start() -> None:
     row: dict[int | str, Summary] = {
         0: Summary.from_episodes("", [0.0, 10.0], [1, 1]), 4: Summary.from_episodes("", [10.0, 0.0], [1, 1])
     }  # fmt: skip
-    assert over_delays.average(row, [0, 4]) == "5.0 [5.0, 5.0]"  # each start has a mean of 5
-    assert over_delays.average(row, [0, 4, 8]) == "5.0 [5.0, 5.0], 2 of 3"
-    assert over_delays.average(row, [8]) == "-"
+    assert average(row, [0, 4]) == "5.0 [5.0, 5.0]"  # each start has a mean of 5
+    assert average(row, [0, 4, 8]) == "5.0 [5.0, 5.0], 2 of 3"
+    assert average(row, [8]) == "-"
 
 
 @pytest.mark.parametrize(
