@@ -12,7 +12,7 @@ import yaml
 from sb3_said.files.atomic import write_text
 from sb3_said.zoo.manager import WRAPPER, read_arguments
 from sb3_said.zoo.runs import read_params
-from sb3_said.zoo.train import make_parser
+from sb3_said.zoo.train import own_parser
 
 
 def write_best(run: Path, folder: Path, planner: dict[str, Any], choice: str) -> str:
@@ -28,7 +28,7 @@ def write_best(run: Path, folder: Path, planner: dict[str, Any], choice: str) ->
     params = next(run.glob("*/args.yml")).parent
     hyperparams, args = read_params(params)
     hyperparams["planner_kwargs"] = {**(hyperparams.get("planner_kwargs") or {}), **planner}
-    options, _ = make_parser().parse_known_args(read_arguments(run))
+    options, _ = own_parser().parse_known_args(read_arguments(run))
     words = ["sb3-said", "train", "--algo", "said", "--env", args["env"]]
     for name, delay in (("--delay", options.delay), ("--expert-delay", options.expert_delay)):
         words += [name, *delay] if delay else []

@@ -24,7 +24,7 @@ from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC, PlannerTrainin
 from sb3_said.delays.processes import make_process
 from sb3_said.files.atomic import write_json
 from sb3_said.files.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback, restore_training
-from sb3_said.zoo.delays import Delay, largest_delay
+from sb3_said.zoo.arguments import Delay, largest_delay
 from sb3_said.zoo.presets import config_file, preset_overrides
 
 ARGUMENTS_NAME = "train_args.json"

@@ -20,8 +20,8 @@ import torch as th
 from sb3_said.delays import FixedDelay
 from sb3_said.delays.processes import age_range, make_process
 from sb3_said.evaluation import Summary, plots
+from sb3_said.zoo.arguments import Delay, check_positive, explained, largest_delay, make_parser, read_delay
 from sb3_said.zoo.cells import Cell, Results, make_table, print_table
-from sb3_said.zoo.delays import Delay, largest_delay, read_delay
 from sb3_said.zoo.runs import ANSWERS, LoadedRun, answering, answers, delay_name, load_run, longest_delay, origin
 
 EPILOG = """\
@@ -53,10 +53,8 @@ A run folder's YAML can run code (rl_zoo3 reads it so): open only folders that y
 """
 
 
-def make_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def main(argv: list[str] | None = None) -> None:
+    parser = make_parser(__doc__, EPILOG)
     parser.add_argument("runs", nargs="*", metavar="[LABEL=]RUN_OR_ZIP", help="run folders, or agents' .zip files; "
                         "without any, what --json holds is shown")  # fmt: skip
     parser.add_argument("--delays", nargs="+", metavar="DELAY", help="each a number of control steps, or a process of "
@@ -74,28 +72,15 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--env", help="task to play (default: the trained one)")
     parser.add_argument("--device", default="auto", help="torch device (default: auto)")
     parser.add_argument("--num-threads", type=int, default=1, help="torch threads of each worker (default: 1)")
-    return parser
-
-
-def main(argv: list[str] | None = None) -> None:
-    parser = make_parser()
     args = parser.parse_args(argv)
-    if min(args.episodes, args.n_envs, args.workers, args.num_threads) < 1:
-        parser.error("--episodes, --n-envs, --workers and --num-threads must be at least 1")
-    th.set_num_threads(args.num_threads)
-    try:
+    with explained(parser):
+        check_positive(args, "episodes", "n_envs", "workers", "num_threads")
+        th.set_num_threads(args.num_threads)
         if args.plot is not None:
             plots.panels()  # without matplotlib, fail now and not after the episodes
         delays = list(dict.fromkeys(read_name(word) for word in args.delays or ()))
         shown = play_missing(args, delays) if args.runs else known_cells(args.json, delays)
         rows = choose_rows(args.rows, shown)
-    except ValueError as error:
-        parser.error(str(error))
-    except ImportError as error:
-        parser.exit(1, f"{error}\n")
-    except KeyboardInterrupt:
-        parser.exit(130, "\nInterrupted; the same command goes on.\n")
-
     table = make_table(shown, rows)
     print_table(table, delays or list(dict.fromkeys(cell.delay for cell in shown)))
     if args.plot is not None and any(table.values()):

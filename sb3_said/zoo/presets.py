@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 
 from sb3_said.planner import PlannerConfig
-from sb3_said.zoo.delays import Delay, is_always, largest_delay
+from sb3_said.zoo.arguments import Delay, is_always, largest_delay
 
 PRESETS = ("cpu", "paper", "smoke", "quick")
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from datetime import datetime, timezone
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, get_args
 
@@ -22,12 +22,12 @@ from rl_zoo3.utils import get_saved_hyperparams, get_wrapper_class
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_said import DelayedSAC
+from sb3_said import DelayedSAC, __version__
 from sb3_said.delays import DelayProcess, FixedDelay
 from sb3_said.delays.space import ages_of, has_state_history
 from sb3_said.evaluation.rollout import Observation, Rollout, rollout
 from sb3_said.said.policies import Answer
-from sb3_said.zoo.delays import Delay, largest_delay
+from sb3_said.zoo.arguments import Delay, largest_delay
 from sb3_said.zoo.manager import ALGOS, WRAPPER
 
 ANSWERS = get_args(Answer)
@@ -133,11 +133,8 @@ def answering(model: BaseAlgorithm, answer: str | None) -> AbstractContextManage
     """
     if answer is None:
         return nullcontext()
-    if answer not in answers(model):
-        raise ValueError(
-            f"This {type(model).__name__} cannot answer as {answer!r}: only a SAID agent has an expert, "
-            "and a planner once that is trained."
-        )
+    if not hasattr(model.policy, "answering"):
+        raise ValueError(f"This {type(model).__name__} cannot answer as {answer!r}: only a SAID agent has an expert.")
     context: AbstractContextManager[Any] = model.policy.answering(answer)  # type: ignore[operator]
     return context
 
@@ -152,29 +149,16 @@ def longest_delay(model: BaseAlgorithm) -> int | None:
 
 def origin(run: LoadedRun) -> dict[str, Any]:
     """Say what a reader needs to judge and repeat the numbers: command, date, machine, versions."""
-    packages = ("sb3_said", "stable_baselines3", "torch", "gymnasium", "mujoco", "numpy")
+    program = sys.argv[0] if sys.argv[0].startswith("sb3-said ") else f"python {sys.argv[0]}"
+    packages = ("stable_baselines3", "torch", "gymnasium", "mujoco", "numpy")
     return {
-        "command": command_line(),
+        "command": f"{program} {shlex.join(sys.argv[1:])}",
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} CPU cores",
         "device": str(run.model.device),
         "torch_threads": th.get_num_threads(),
-        "versions": {"python": platform.python_version(), **{package: version_of(package) for package in packages}},
+        "versions": {"python": platform.python_version(), "sb3_said": __version__, **{p: version(p) for p in packages}},
     }
-
-
-def command_line() -> str:
-    """Return what was typed."""
-    program = sys.argv[0] if sys.argv[0].startswith("sb3-said ") else f"python {shlex.quote(sys.argv[0])}"
-    return f"{program} {shlex.join(sys.argv[1:])}"
-
-
-def version_of(package: str) -> str:
-    """Return the installed version; a clone can run without being installed."""
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "not installed"
 
 
 def _find(path: Path) -> tuple[Path, Path | None]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import rl_zoo3.train
 
-from sb3_said.zoo.delays import add_delay, read_delay
+from sb3_said.zoo.arguments import add_delay, explained, make_parser, read_delay
 from sb3_said.zoo.manager import ALGORITHMS, DelayedExperimentManager, Run, read_arguments
 from sb3_said.zoo.presets import PRESETS
 
@@ -27,11 +27,9 @@ Below: the options of rl_zoo3, all of which work here.
 """
 
 
-def make_parser() -> argparse.ArgumentParser:
+def own_parser() -> argparse.ArgumentParser:
     """Return the parser of the options that rl_zoo3 does not have."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter, add_help=False
-    )
+    parser = make_parser(__doc__, EXAMPLES, add_help=False)
     parser.add_argument("-h", "--help", action="store_true", help="show this help, then that of rl_zoo3")
     parser.add_argument("--algo", choices=list(ALGORITHMS), default="said", help="default: said")
     add_delay(parser, default="no delay")
@@ -46,11 +44,7 @@ def make_parser() -> argparse.ArgumentParser:
         "delay where --delay varies; quick, smoke: minutes (default: cpu)",
     )
     parser.add_argument(
-        "--checkpoint-freq",
-        type=int,
-        default=25_000,
-        metavar="STEPS",
-        help="steps between checkpoints (default: 25000)",
+        "--checkpoint-freq", type=int, default=25_000, metavar="N", help="steps between checkpoints (default: 25000)"
     )
     parser.add_argument("--resume", type=Path, metavar="RUN_DIR", help="go on with a run from its last checkpoint")
     return parser
@@ -58,19 +52,16 @@ def make_parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> None:
     """Train as the command line says."""
-    parser = make_parser()
-    try:
+    parser = own_parser()
+    with explained(parser):
         run, algo, zoo_argv = read_command_line(sys.argv[1:] if argv is None else argv)
-    except ValueError as error:
-        parser.error(str(error))
     if "--help" in zoo_argv:
         parser.print_help()
 
     def make_manager(*args: Any, **kwargs: Any) -> DelayedExperimentManager:
-        try:
-            return DelayedExperimentManager(run, *args, **kwargs)
-        except ValueError as error:
-            parser.error(str(error))
+        with explained(parser):
+            manager = DelayedExperimentManager(run, *args, **kwargs)
+        return manager
 
     rl_zoo3.train.ExperimentManager = make_manager  # type: ignore[misc,assignment]
     sys.argv = [sys.argv[0], "--algo", algo, *zoo_argv]
@@ -88,7 +79,7 @@ def read_command_line(argv: list[str]) -> tuple[Run, str, list[str]]:
     given, argv = resuming.parse_known_args(argv)
     if given.resume is not None:
         argv = [*read_arguments(given.resume), *argv]
-    options, zoo_argv = make_parser().parse_known_args(argv)
+    options, zoo_argv = own_parser().parse_known_args(argv)
     delay, expert_delay = read_delay(options.delay), read_delay(options.expert_delay)
     if expert_delay is not None and (options.algo != "said" or delay is None):
         raise ValueError("--expert-delay needs --algo said and a --delay: an agent without a planner is its expert.")

@@ -19,6 +19,7 @@ from sb3_said import SAID
 from sb3_said.evaluation import bootstrap_interval
 from sb3_said.files.atomic import write_json
 from sb3_said.files.checkpoint import CHECKPOINT_NAME
+from sb3_said.zoo.arguments import check_positive, explained, make_parser
 from sb3_said.zoo.best import write_best
 from sb3_said.zoo.depths import DepthPlanners
 from sb3_said.zoo.evaluate import evaluate
@@ -37,7 +38,7 @@ examples:
   # a quick look: one depth, fewer updates, fewer episodes, into a folder of its own
   sb3-said tune --run logs/said/Hopper-v5-delay4_1 --depths 2 --gradient-steps 5000 --episodes 10 --output look
 
-  # one denoising step is the mean of the likely plans: worse on one task, better and five times as fast on another
+  # fewer denoising steps are faster, and on some tasks better
   sb3-said tune --run logs/said/HalfCheetah-v5-delay0-16_1 --depths 2 --temperatures 0 --sampling-steps 1 2 5
 
   # any temperature from 0 to 1, in a data base
@@ -59,10 +60,8 @@ A run folder's YAML can run code (rl_zoo3 reads it so): open only folders that y
 DEPTHS, TEMPERATURES = [2, 4, 8], [0.0, 0.1, 0.3, 0.6, 0.8, 1.0]
 
 
-def make_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def main(argv: list[str] | None = None) -> None:
+    parser = make_parser(__doc__, EPILOG)
     add = parser.add_argument
     add("--run", type=Path, required=True, metavar="RUN_DIR", help="folder that sb3-said train left")
     add("--depths", type=int, nargs="+", default=DEPTHS, metavar="N", help="default: 2 4 8")
@@ -85,31 +84,19 @@ def make_parser() -> argparse.ArgumentParser:
     add("--device", default="auto", help="torch device (default: auto)")
     add("--num-threads", type=int, help="torch threads (default: torch's own choice)")
     add("-P", "--progress", action="store_true", help="show a progress bar while a planner trains")
-    return parser
-
-
-def main(argv: list[str] | None = None) -> None:
-    parser = make_parser()
     args = parser.parse_args(argv)
     if args.num_threads is not None:
         th.set_num_threads(args.num_threads)
-    try:
+    with explained(parser):
         check(args)
         tune(args)
-    except ValueError as error:
-        parser.error(str(error))
-    except KeyboardInterrupt:
-        parser.exit(130, "\nInterrupted; the same command goes on.\n")
 
 
 def check(args: argparse.Namespace) -> None:
     """
     :raises ValueError: for options that make no search
     """
-    for name in ("episodes", "round", "report_episodes", "n_trials", "gradient_steps"):
-        value = getattr(args, name)
-        if value is not None and value < 1:
-            raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {value}.")
+    check_positive(args, "episodes", "round", "report_episodes", "n_trials", "gradient_steps")
     if not 0 <= args.prune < 1:
         raise ValueError(f"--prune is a p-value in [0, 1), got {args.prune}; 0 prunes nothing.")
     for name in ("depths", "temperatures", "sampling_steps"):

@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("rl_zoo3")
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC, PlannerConfig
-from sb3_said.zoo.delays import Delay
+from sb3_said.zoo.arguments import Delay
 from sb3_said.zoo.manager import ALGORITHMS, DelayedExperimentManager, Run
 from sb3_said.zoo.presets import PRESETS, config_file, preset_overrides
 

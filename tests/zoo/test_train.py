@@ -22,7 +22,7 @@ from sb3_said import SAID, DelayedSAC
 from sb3_said.files.archive import load_tree
 from sb3_said.files.checkpoint import TrainingCheckpointCallback
 from sb3_said.zoo import manager, train
-from sb3_said.zoo.delays import Delay
+from sb3_said.zoo.arguments import Delay
 from sb3_said.zoo.runs import load_run
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"

@@ -22,8 +22,8 @@ from sb3_said import SAID, PlannerConfig
 from sb3_said.files.archive import load_tree
 from sb3_said.files.checkpoint import CHECKPOINT_NAME
 from sb3_said.zoo import tune
+from sb3_said.zoo.arguments import read_delay
 from sb3_said.zoo.best import plain_settings
-from sb3_said.zoo.delays import read_delay
 from sb3_said.zoo.runs import LoadedRun, load_run
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "tune.py"

@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 
 from sb3_said.zoo import train
-from sb3_said.zoo.delays import Delay
+from sb3_said.zoo.arguments import Delay
 from sb3_said.zoo.manager import DelayedExperimentManager, Run
 
 ENV = "InvertedPendulum-v5"

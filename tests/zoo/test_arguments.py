@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sb3_said.zoo.delays import Delay, is_always, largest_delay, read_delay
+from sb3_said.zoo.arguments import Delay, is_always, largest_delay, read_delay
 
 
 @pytest.mark.parametrize(
