@@ -26,42 +26,43 @@ def write_best(run: Path, folder: Path, planner: dict[str, Any], choice: str) ->
     :param choice: how they were chosen, for a comment
     """
     params = next(run.glob("*/args.yml")).parent
-    hyperparams, args = read_params(params)
-    hyperparams["planner_kwargs"] = {**(hyperparams.get("planner_kwargs") or {}), **planner}
+    config = dict(yaml.load((params / "config.yml").read_text(), Loader=yaml.UnsafeLoader))
+    config["planner_kwargs"] = {**(config.get("planner_kwargs") or {}), **planner}
+    beside = shutil.copytree(params, folder / params.name, dirs_exist_ok=True)  # VecNormalize's statistics, too
+    write_text(beside / "config.yml", yaml.dump(config))
+
+    args = read_params(params)[1]
     options, _ = own_parser().parse_known_args(read_arguments(run))
     words = ["sb3-said", "train", "--algo", "said", "--env", args["env"]]
     for name, delay in (("--delay", options.delay), ("--expert-delay", options.expert_delay)):
         words += [name, *delay] if delay else []
     command = shlex.join([*words, "-conf", str(folder / "best.yml")])
 
-    block, left_out = plain_settings(hyperparams, args)
+    block, left_out = plain_settings(config, args)
     lines = [f"{', '.join(planner)}: {choice}; see results.json.", command]
     lines += [f"Left out, as YAML cannot hold it: {name}" for name in left_out]
     text = "".join(f"# {line}\n" for line in lines) + yaml.safe_dump({args["env"]: block}, sort_keys=False)
     write_text(folder / "best.yml", text)
-
-    beside = shutil.copytree(params, folder / params.name, dirs_exist_ok=True)  # VecNormalize's statistics, too
-    config = yaml.load((params / "config.yml").read_text(), Loader=yaml.UnsafeLoader)
-    write_text(beside / "config.yml", yaml.dump({**config, "planner_kwargs": hyperparams["planner_kwargs"]}))
     return command
 
 
-def plain_settings(hyperparams: dict[str, Any], args: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+def plain_settings(config: dict[str, Any], args: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """Return hyper-parameters as rl_zoo3 reads them from YAML, and the names of those that YAML cannot hold.
 
-    The wrapper of the delay is left out, since ``--delay`` adds it; what the command line set beside the
-    hyper-parameters is taken in.
+    The wrapper of the delay is left out, since ``--delay`` adds it.
+
+    :param config: a run's config.yml
+    :param args: its command line, whose settings beside the hyper-parameters are taken in
     """
-    wrappers = hyperparams.get("env_wrapper") or []
+    wrappers = config.get("env_wrapper") or []
     wrappers = wrappers if isinstance(wrappers, list) else [wrappers]
-    given = {**hyperparams, "env_wrapper": [w for w in wrappers if not (isinstance(w, dict) and WRAPPER in w)]}
+    given = {**config, "env_wrapper": [w for w in wrappers if not (isinstance(w, dict) and WRAPPER in w)]}
     given |= {"env_kwargs": args["env_kwargs"]} if args.get("env_kwargs") else {}
     given |= {"n_timesteps": args["n_timesteps"]} if args.get("n_timesteps", -1) > 0 else {}
-    given.pop("normalize_kwargs", None)  # rl_zoo3 adds this when it reads a run, and a normalize that is False
+    if not given["env_wrapper"]:
+        del given["env_wrapper"]
     block, left_out = {}, []
     for name, value in given.items():
-        if name in ("normalize", "env_wrapper") and not value:
-            continue
         try:
             block[name] = yaml.safe_load(yaml.safe_dump(value))
         except yaml.YAMLError:

@@ -20,7 +20,7 @@ import torch as th
 from sb3_said.delays import FixedDelay
 from sb3_said.delays.processes import age_range, make_process
 from sb3_said.evaluation import Summary, plots
-from sb3_said.zoo.arguments import Delay, check_positive, explained, largest_delay, make_parser, read_delay
+from sb3_said.zoo.arguments import check_positive, explained, largest_delay, make_parser, read_delay
 from sb3_said.zoo.cells import Cell, Results, make_table, print_table
 from sb3_said.zoo.runs import ANSWERS, LoadedRun, answering, answers, delay_name, load_run, longest_delay, origin
 
@@ -42,9 +42,8 @@ examples:
   # the table and the plot once more, of some rows and delays: without runs nothing is played
   sb3-said over-delays --json hopper.json --rows "any planner" "each planner" --delays 0 4 16 --plot hopper.png
 
-Of a SAID agent, the planner and the expert are played, or one of them (--answer). An agent cannot play delays that it
-was not built for: such a cell stays empty. It does play delays that it was not trained with, which is the point here,
-without a warning.
+Of a SAID agent, the planner and the expert are played, or one of them (--answer). A delay that an agent was not built
+for leaves an empty cell; one that it was not trained with is played, without a warning.
 Episode i starts from reset seed --seed + i under every delay, so that all cells meet the same starts. An average over
 delays has an interval over these starts, each with its mean over the delays.
 What --json holds of the same agents (by the contents of their files) is not played again; an agent that has changed
@@ -176,7 +175,8 @@ def open_runs(args: argparse.Namespace) -> dict[str, list[LoadedRun]]:
     for text in args.runs:
         given, path = re.fullmatch(r"(?:([^=/]+)=)?(.*)", text, re.DOTALL).groups()  # type: ignore[union-attr]  # fits all
         label = given or "/".join(Path(path).absolute().parts[-2:]).removesuffix(".zip")
-        run = open_run(path, args.algo, args.env, None, args.device)
+        with at_any_age():
+            run = load_run(path, args.algo, args.env, None, args.device)
         row = runs.setdefault(label, [])
         if any(run.info["delay"] == other.info["delay"] for other in row):
             raise ValueError(
@@ -184,16 +184,10 @@ def open_runs(args: argparse.Namespace) -> dict[str, list[LoadedRun]]:
                 f"LABEL={path}."
             )
         row.append(run)
-    tasks = {label: sorted({run.info["env"] for run in row}) for label, row in runs.items()}
-    if len({task for names in tasks.values() for task in names}) > 1:
+    tasks = sorted({run.info["env"] for row in runs.values() for run in row})
+    if len(tasks) > 1:
         raise ValueError(f"Returns of several tasks cannot be compared: {tasks}. Give runs of one task, or --env.")
     return runs
-
-
-def open_run(path: str, algo: str | None, env_id: str | None, delay: Delay, device: str) -> LoadedRun:
-    """Open a run, whatever it was trained with."""
-    with at_any_age():
-        return load_run(path, algo, env_id, delay, device)
 
 
 @contextmanager
@@ -221,11 +215,9 @@ def cells_of(label: str, row: list[LoadedRun], delays: list[int | str], only: st
                 agent=f"{label} {answer}" if answer else label,
                 answer=answer,
                 delay=delay,
-                algo=run.info["algo"],
-                file=run.info["file"],
                 sha256=digest,
-                trained_steps=run.info["trained_steps"],
                 obstacle=obstacle(run.model, answer, delay),
+                **{key: run.info[key] for key in ("algo", "file", "trained_steps")},
             )
 
 
@@ -263,7 +255,8 @@ def play_all(cells: list[Cell], env_id: str, args: argparse.Namespace) -> Iterat
 
 def play(cell: Cell, env_id: str, episodes: int, seed: int, n_envs: int, device: str) -> Summary:
     """Play the episodes of a cell."""
-    run = open_run(cell.file, cell.algo, env_id, cell.delay, device)
-    with answering(run.model, cell.answer), at_any_age():
-        played = run.play(episodes, seed, n_envs)
+    with at_any_age():
+        run = load_run(cell.file, cell.algo, env_id, cell.delay, device)
+        with answering(run.model, cell.answer):
+            played = run.play(episodes, seed, n_envs)
     return Summary.from_episodes(cell.agent, played.returns, played.lengths)

@@ -104,13 +104,8 @@ def load_run(
     if isinstance(model, DelayedSAC):
         model.check_ages(ages_of(env))
     env.close()
-    info = {
-        "algo": algo,
-        "env": env_id,
-        "delay": delay_name(delay_process),
-        "file": str(file),
-        "trained_steps": model.num_timesteps,
-    }
+    info = {"algo": algo, "env": env_id, "delay": delay_name(delay_process)}
+    info |= {"file": str(file), "trained_steps": model.num_timesteps}
     return LoadedRun(model, make_env, _load_normalize(params, hyperparams, make_env), file.parent, info)
 
 
@@ -199,24 +194,20 @@ def _with_delay(wrappers: list[Any], delay: Delay, model: BaseAlgorithm) -> list
     max_delay = longest_delay(model)
     if max_delay is None:
         if largest_delay(delay) > 0:
-            raise ValueError(
-                f"This agent reads {model.observation_space}, not delayed observations: "
-                f"it cannot play with --delay {delay}."
-            )
+            space = model.observation_space
+            raise ValueError(f"This agent reads {space}, not delayed observations: leave out --delay {delay}.")
         return wrappers
     if largest_delay(delay) > max_delay:
         raise ValueError(f"This agent was built for delays 0..{max_delay}, got --delay {delay}.")
     kwargs: dict[str, Any] = {"delay": max_delay if delay is None else delay, "max_delay": max_delay}
     if has_state_history(model.observation_space):
         kwargs["state_history"] = True
-    names = [next(iter(w)) if isinstance(w, dict) else w for w in wrappers]
-    delayed = [str(name).endswith(WRAPPER.rsplit(".", 1)[1]) for name in names]
-    if not any(delayed):
+    name = WRAPPER.rsplit(".", 1)[1]
+    is_delay = [name in str(wrapper) for wrapper in wrappers]
+    if not any(is_delay):
         return [*wrappers, {WRAPPER: kwargs}]
-    return [
-        {name: {**(w[name] if isinstance(w, dict) else {}), **kwargs}} if is_delay else w
-        for w, name, is_delay in zip(wrappers, names, delayed, strict=True)
-    ]
+    old = [next(iter(w.values())) if isinstance(w, dict) else {} for w in wrappers]
+    return [{WRAPPER: {**o, **kwargs}} if d else w for w, o, d in zip(wrappers, old, is_delay, strict=True)]
 
 
 def _check_spaces(model: BaseAlgorithm, env: gym.Env[Any, Any], file: Path) -> None:

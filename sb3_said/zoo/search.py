@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
+import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +32,19 @@ class Stopped(BaseException):
     """
 
 
-@dataclass
-class Search:
-    """Settings of the planner tried on the same episodes; the best mean return wins.
+def search(
+    study: optuna.Study,
+    tried: dict[str, list[Any]],
+    put: Callable[..., None],
+    play: Callable[[int, int], Sequence[float]],
+    sampler: str = "grid",
+    n_trials: int | None = None,
+    episodes: int = 20,
+    round_size: int = 5,
+    seed: int = 20_000,
+    timeout: float | None = None,
+) -> None:
+    """Try settings of the planner on the same episodes, until no trial is left to begin.
 
     With the sampler ``grid`` every cell is tried once; at the end two workers may try the same one. ``tpe`` draws
     temperatures between the lowest and the highest. A trial reports the return of every episode. It is pruned once a
@@ -49,77 +59,79 @@ class Search:
     :param episodes: of a trial
     :param round_size: episodes between two looks at pruning
     :param seed: reset seed of the first episode
+    :param timeout: seconds after which no trial is begun
     """
 
-    study: optuna.Study
-    tried: dict[str, list[Any]]
-    put: Callable[..., None]
-    play: Callable[[int, int], Sequence[float]]
-    sampler: str = "grid"
-    n_trials: int | None = None
-    episodes: int = 20
-    round_size: int = 5
-    seed: int = 20_000
-
-    def run(self, timeout: float | None = None) -> None:
-        """Make trials until there is none left to begin.
-
-        :param timeout: seconds after which none is begun
-        """
-        # TPE has no seed: workers that begin together are to draw differently.
-        grid = GridSampler(self.tried)
-        self.study.sampler = grid if self.sampler == "grid" else TPESampler(n_startup_trials=6, constant_liar=True)
-        limit = self.n_trials
-        if limit is None and self.sampler == "tpe":
-            limit = math.prod(map(len, self.tried.values()))
-        n_made = len(self.study.get_trials(deepcopy=False, states=FINISHED))
-        if (self.sampler == "grid" and grid.is_exhausted(self.study)) or (limit is not None and n_made >= limit):
-            print("No trial is left to make.")
-            return
-        callbacks = [] if limit is None else [MaxTrialsCallback(limit, states=FINISHED)]
+    def objective(trial: Trial) -> float:
+        params = suggest(trial, tried, sampler)
+        known = next((made for made in finished(study) if made.params == params), None)
+        if known is not None:  # of a smaller grid, in an earlier call
+            return repeat(trial, known)
         try:
-            self.study.optimize(self._try, timeout=timeout, callbacks=callbacks)
-        except Stopped as stopped:
-            raise stopped.__cause__ or stopped from None
-
-    def _try(self, trial: Trial) -> float:
-        params = {name: self._suggest(trial, name, values) for name, values in self.tried.items()}
-        known = next((made for made in finished(self.study) if made.params == params), None)
-        if known is not None:  # in a smaller grid, of an earlier call
-            for step, value in known.intermediate_values.items():
-                trial.report(value, step)
-            if known.value is None or known.state == TrialState.PRUNED:
-                raise optuna.TrialPruned
-            return known.value
-        try:
-            self.put(**params)
-            return self._play(trial)
+            put(**params)
+            return play_trial(trial, play, episodes, round_size, seed)
         except optuna.TrialPruned:
             raise
         except (Exception, KeyboardInterrupt) as error:
             raise Stopped from error
 
-    def _suggest(self, trial: Trial, name: str, values: list[Any]) -> Any:
-        if name == "temperature":
-            return trial.suggest_float(name, min(values), max(values))
-        if self.sampler == "tpe":
-            return trial.suggest_categorical(name, values)
-        return trial.suggest_int(name, min(values), max(values))  # a grid can grow, the choices of a category cannot
+    grid = GridSampler(tried)
+    # Without a seed: workers that begin together are to draw differently.
+    study.sampler = grid if sampler == "grid" else TPESampler(n_startup_trials=6, constant_liar=True)
+    limit = n_trials or (math.prod(map(len, tried.values())) if sampler == "tpe" else sys.maxsize)
+    n_made = len(study.get_trials(deepcopy=False, states=FINISHED))
+    if n_made >= limit or (sampler == "grid" and grid.is_exhausted(study)):
+        print("No trial is left to make.")
+        return
+    try:
+        study.optimize(objective, timeout=timeout, callbacks=[MaxTrialsCallback(limit, states=FINISHED)])
+    except Stopped as stopped:
+        raise stopped.__cause__ or stopped from None
 
-    def _play(self, trial: Trial) -> float:
-        returns: list[float] = []
-        is_pruned = False
-        while len(returns) < self.episodes and not is_pruned:
-            for value in self.play(self.seed + len(returns), min(self.round_size, self.episodes - len(returns))):
-                trial.report(float(value), len(returns))
-                returns.append(float(value))
-            is_pruned = len(returns) < self.episodes and trial.should_prune()
-        mean = float(np.mean(returns))
-        told = f"trial {trial.number}: {describe(trial.params)}: mean return {mean:,.1f} over {len(returns)} episodes"
-        print(told + " (pruned)" * is_pruned, flush=True)
-        if is_pruned:
-            raise optuna.TrialPruned
-        return mean
+
+def suggest(trial: Trial, tried: dict[str, list[Any]], sampler: str) -> dict[str, Any]:
+    """Let the sampler choose one of the settings."""
+    params: dict[str, Any] = {}
+    for name, values in tried.items():
+        if name == "temperature":
+            params[name] = trial.suggest_float(name, min(values), max(values))
+        elif sampler == "tpe":
+            params[name] = trial.suggest_categorical(name, values)
+        else:  # a range, which can grow with the grid; the choices of a category cannot
+            params[name] = trial.suggest_int(name, min(values), max(values))
+    return params
+
+
+def repeat(trial: Trial, known: FrozenTrial) -> float:
+    """Report what another trial of the same settings did, and end as it did."""
+    returns = returns_of(known)
+    for step, value in enumerate(returns):
+        trial.report(value, step)
+    if known.state == TrialState.PRUNED:
+        raise optuna.TrialPruned
+    return float(np.mean(returns))
+
+
+def play_trial(
+    trial: Trial, play: Callable[[int, int], Sequence[float]], episodes: int, round_size: int, seed: int
+) -> float:
+    """Report the episodes of a trial, and return their mean.
+
+    :raises TrialPruned: when it is worse than the best
+    """
+    returns: list[float] = []
+    is_pruned = False
+    while len(returns) < episodes and not is_pruned:
+        for value in play(seed + len(returns), min(round_size, episodes - len(returns))):
+            trial.report(float(value), len(returns))
+            returns.append(float(value))
+        is_pruned = len(returns) < episodes and trial.should_prune()
+    mean = float(np.mean(returns))
+    told = f"trial {trial.number}: {describe(trial.params)}: mean return {mean:,.1f} over {len(returns)} episodes"
+    print(told + " (pruned)" * is_pruned, flush=True)
+    if is_pruned:
+        raise optuna.TrialPruned
+    return mean
 
 
 def open_study(folder: Path, storage: str, name: str, settings: dict[str, Any], prune: float) -> optuna.Study:
@@ -135,24 +147,21 @@ def open_study(folder: Path, storage: str, name: str, settings: dict[str, Any], 
     with warnings.catch_warnings(), FileLock(folder / "study.lock"):
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         pruner = optuna.pruners.WilcoxonPruner(p_threshold=prune) if prune > 0 else optuna.pruners.NopPruner()
+        if "://" in storage:
+            # SQLite lets one worker write at a time, and tells the others that wait longer than this to give up.
+            patience = {"connect_args": {"timeout": 120}} if storage.startswith("sqlite") else {}
+            backend: BaseStorage = RDBStorage(storage, engine_kwargs=patience)
+        else:
+            Path(storage).parent.mkdir(parents=True, exist_ok=True)
+            backend = JournalStorage(JournalFileBackend(storage))
         study = optuna.create_study(
-            storage=open_storage(storage), study_name=name, direction="maximize", load_if_exists=True, pruner=pruner
+            storage=backend, study_name=name, direction="maximize", load_if_exists=True, pruner=pruner
         )
         if "settings" not in study.user_attrs:
             study.set_user_attr("settings", settings)
     advice = "Go on with the old ones, or begin another study with --study-name."
     check_same(f"Study {name!r} in {storage} was begun", study.user_attrs["settings"], settings, advice)
     return study
-
-
-def open_storage(storage: str) -> BaseStorage:
-    """Open an RDB by its URL, or a journal file by its path."""
-    if "://" in storage:
-        # SQLite lets one worker write at a time, and tells the others that wait longer than this to give up.
-        patience = {"connect_args": {"timeout": 120}} if storage.startswith("sqlite") else {}
-        return RDBStorage(storage, engine_kwargs=patience)
-    Path(storage).parent.mkdir(parents=True, exist_ok=True)
-    return JournalStorage(JournalFileBackend(storage))
 
 
 def finished(study: optuna.Study) -> list[FrozenTrial]:

@@ -24,7 +24,7 @@ from sb3_said.zoo.best import write_best
 from sb3_said.zoo.depths import DepthPlanners
 from sb3_said.zoo.evaluate import evaluate
 from sb3_said.zoo.runs import ANSWERS, LoadedRun, load_run, origin
-from sb3_said.zoo.search import Search, describe, find_winner, finished, open_study, returns_of, save_plot
+from sb3_said.zoo.search import describe, find_winner, finished, open_study, returns_of, save_plot, search
 
 EPILOG = """\
 examples:
@@ -141,8 +141,9 @@ def tune(args: argparse.Namespace) -> None:
         return [float(value) for value in run.play(n, seed, n).returns]
 
     planners.train(args.depths)
-    search = Search(study, tried, planners.put, play, args.sampler, args.n_trials, args.episodes, args.round, args.seed)
-    search.run(None if args.timeout is None else max(args.timeout - (time.monotonic() - began), 0.0))
+    left = None if args.timeout is None else max(args.timeout - (time.monotonic() - began), 0.0)
+    how = (args.sampler, args.n_trials, args.episodes, args.round, args.seed, left)
+    search(study, tried, planners.put, play, *how)
     winner = find_winner(study)
     if winner is None:
         raise ValueError("No trial is finished, so there is no winner: give more --timeout or --n-trials.")

@@ -12,9 +12,10 @@ import pytest
 pytest.importorskip("rl_zoo3")
 pytest.importorskip("scipy")
 
+from optuna import Study
 from optuna.trial import TrialState
 
-from sb3_said.zoo.search import Search, find_winner, finished, open_study, returns_of, save_plot
+from sb3_said.zoo.search import find_winner, finished, open_study, returns_of, save_plot, search
 
 
 class Agent:
@@ -34,7 +35,7 @@ class Agent:
         return [self.strength(**self.settings) + self.noise * float(rng.normal()) for rng in rngs]
 
 
-def search(
+def run(
     folder: Path,
     agent: Agent,
     temperatures: list[float],
@@ -42,26 +43,26 @@ def search(
     storage: str = "",
     prune: float = 0.0,
     **options: Any,
-) -> Search:
+) -> Study:
     tried = {"depth": [2], "temperature": temperatures, "sampling_steps": list(steps)}
     study = open_study(folder, storage or str(folder / "study.log"), "test", {}, prune)
-    return Search(study, tried, agent.put, agent.play, **{"episodes": 2, **options})
+    search(study, tried, agent.put, agent.play, **{"episodes": 2, **options})
+    return study
 
 
-def cells(made: Search) -> list[tuple[float, int]]:
-    return sorted((t.params["temperature"], t.params["sampling_steps"]) for t in finished(made.study))
+def cells(study: Study) -> list[tuple[float, int]]:
+    return sorted((t.params["temperature"], t.params["sampling_steps"]) for t in finished(study))
 
 
 def test_a_hopeless_trial_is_pruned_and_a_close_one_is_not(tmp_path: Path) -> None:
     strength = {0.0: 100.0, 0.5: 0.0, 1.0: 99.0}
     agent = Agent(lambda temperature, **_: strength[temperature], noise=20.0)
     for temperatures in ([0.0], [0.0, 0.5, 1.0]):  # a good one first, whatever the order of a grid
-        made = search(tmp_path, agent, temperatures, prune=0.05, episodes=20)
-        made.run()
-    trials = {trial.params["temperature"]: trial for trial in finished(made.study)}
+        study = run(tmp_path, agent, temperatures, prune=0.05, episodes=20)
+    trials = {trial.params["temperature"]: trial for trial in finished(study)}
     assert trials[0.5].state == TrialState.PRUNED and len(returns_of(trials[0.5])) == 5
     assert trials[0.0].state == trials[1.0].state == TrialState.COMPLETE
-    winner = find_winner(made.study)
+    winner = find_winner(study)
     assert winner is not None and winner.params["temperature"] != 0.5 and len(returns_of(winner)) == 20
 
 
@@ -69,13 +70,12 @@ def test_a_grid_that_grew_plays_only_what_is_new(tmp_path: Path, capsys: pytest.
     pytest.importorskip("matplotlib")
     agent = Agent(lambda sampling_steps, **_: -abs(sampling_steps - 2.0))
     for steps in ([1, 2], [1, 2], [2, 5]):
-        made = search(tmp_path, agent, [0.0, 1.0], steps)
-        made.run()
+        study = run(tmp_path, agent, [0.0, 1.0], steps)
     assert agent.n_put == 6 and "No trial is left to make" in capsys.readouterr().out
-    assert cells(made) == [(0.0, 1), (0.0, 2), (0.0, 5), (1.0, 1), (1.0, 2), (1.0, 5)]
-    winner = find_winner(made.study)  # of equals, the coldest
+    assert cells(study) == [(0.0, 1), (0.0, 2), (0.0, 5), (1.0, 1), (1.0, 2), (1.0, 5)]
+    winner = find_winner(study)  # of equals, the coldest
     assert winner is not None and winner.params == {"depth": 2, "temperature": 0.0, "sampling_steps": 2}
-    save_plot(made.study, tmp_path / "slice.png")
+    save_plot(study, tmp_path / "slice.png")
     assert (tmp_path / "slice.png").read_bytes()[:4] == b"\x89PNG"
 
 
@@ -91,30 +91,27 @@ def test_a_cell_that_was_not_finished_is_tried_again(error: type[BaseException],
 
     broken.play = play  # type: ignore[method-assign]
     with pytest.raises(error):
-        search(tmp_path, broken, [0.0, 0.5, 1.0]).run()
+        run(tmp_path, broken, [0.0, 0.5, 1.0])
     agent = Agent(lambda temperature, **_: temperature)
-    made = search(tmp_path, agent, [0.0, 0.5, 1.0])
-    made.run()
-    assert agent.n_put == 2 and cells(made) == [(0.0, 5), (0.5, 5), (1.0, 5)]
+    study = run(tmp_path, agent, [0.0, 0.5, 1.0])
+    assert agent.n_put == 2 and cells(study) == [(0.0, 5), (0.5, 5), (1.0, 5)]
 
 
 @pytest.mark.parametrize("sampler", ["grid", "tpe"])
 def test_no_trial_is_begun_after_the_timeout_or_the_last_one(sampler: str, tmp_path: Path) -> None:
     agent = Agent(lambda temperature, **_: temperature)
-    made = search(tmp_path, agent, [0.0, 0.5, 1.0], sampler=sampler, n_trials=2)
-    made.run(timeout=0.0)
+    run(tmp_path, agent, [0.0, 0.5, 1.0], sampler=sampler, n_trials=2, timeout=0.0)
     assert agent.n_put == 0
     for _ in range(2):
-        made.run()
-        assert agent.n_put == len(finished(made.study)) == 2
+        study = run(tmp_path, agent, [0.0, 0.5, 1.0], sampler=sampler, n_trials=2)
+        assert agent.n_put == len(finished(study)) == 2
 
 
 @pytest.mark.parametrize("storage", ["", "sqlite:///{}/study.db"])
 def test_tpe_tries_as_many_as_it_is_told(tmp_path: Path, storage: str) -> None:
     agent = Agent(lambda temperature, **_: -abs(temperature - 0.5))
-    made = search(tmp_path, agent, [0.0, 1.0], [1, 5], storage.format(tmp_path), sampler="tpe", n_trials=12)
-    made.run()
-    trials = finished(made.study)
+    study = run(tmp_path, agent, [0.0, 1.0], [1, 5], storage.format(tmp_path), sampler="tpe", n_trials=12)
+    trials = finished(study)
     assert len(trials) == 12 and {trial.params["sampling_steps"] for trial in trials} <= {1, 5}
     temperatures = {trial.params["temperature"] for trial in trials}
     assert len(temperatures) > 2 and 0.0 <= min(temperatures) <= max(temperatures) <= 1.0
