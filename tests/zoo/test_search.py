@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -115,6 +116,17 @@ def test_tpe_tries_as_many_as_it_is_told(tmp_path: Path, storage: str) -> None:
     assert len(trials) == 12 and {trial.params["sampling_steps"] for trial in trials} <= {1, 5}
     temperatures = {trial.params["temperature"] for trial in trials}
     assert len(temperatures) > 2 and 0.0 <= min(temperatures) <= max(temperatures) <= 1.0
+
+
+@pytest.mark.parametrize("storage", ["", "sqlite:///{}/study.db"])
+def test_workers_share_a_grid(storage: str, tmp_path: Path) -> None:
+    agents = [Agent(lambda temperature, **_: temperature) for _ in range(3)]
+    temperatures = [k / 8 for k in range(9)]
+    with ThreadPoolExecutor(3) as pool:
+        made = [pool.submit(run, tmp_path, agent, temperatures, (5,), storage.format(tmp_path)) for agent in agents]
+        studies = [one.result() for one in made]
+    assert all(cells(study) == [(t, 5) for t in temperatures] for study in studies)
+    assert sum(agent.n_put for agent in agents) < 2 * len(temperatures)  # at the end, a cell may be tried twice
 
 
 def test_a_study_begun_otherwise_is_refused(tmp_path: Path) -> None:

@@ -31,9 +31,10 @@ ENV = "InvertedPendulum-v5"
 
 
 def arguments(folder: Path) -> list[str]:
-    base = f"--algo said --env {ENV} --delay 2 --preset smoke -n 600 --seed 3 --num-threads 1 --verbose 0"
-    options = "--eval-freq 300 --checkpoint-freq 100 --device cpu"
-    return [*base.split(), *options.split(), "-f", str(folder), "-params", TINY_PLANNER]
+    base = f"--algo said --env {ENV} --delay 2 --preset smoke -n 400 --seed 3 --num-threads 1 --verbose 0"
+    options = "--eval-freq 200 --checkpoint-freq 100 --device cpu"
+    params = ["learning_starts:150", "planner_gradient_steps:20", TINY_PLANNER]
+    return [*base.split(), *options.split(), "-f", str(folder), "-params", *params]
 
 
 def train_here(folder: Path, command: str, *more: str | Path) -> None:
@@ -62,13 +63,13 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_run_leaves_an_agent_that_answers_with_its_planner(finished: Path) -> None:
     model = SAID.load(finished / f"{ENV}.zip")
-    assert model.num_timesteps == 600
+    assert model.num_timesteps == 400
     assert model.policy.planner_is_trained
     assert model.policy.max_delay == 2
     config = (finished / ENV / "config.yml").read_text()  # what enjoy and evaluate make the task from
     assert "DelayedObservationWrapper" in config and "delay: 2" in config
     evaluations = np.load(finished / "evaluations.npz")
-    assert evaluations["timesteps"].tolist() == [300, 600]
+    assert evaluations["timesteps"].tolist() == [200, 400]
     header = (finished / "progress.csv").read_text().splitlines()[0]
     assert "planner/present_error_mlp_d2" in header and "planner/action_error_d2" in header
 
@@ -84,7 +85,7 @@ def test_a_killed_run_goes_on_from_its_checkpoint_twice_alike(
 ) -> None:
     def save(callback: TrainingCheckpointCallback, original: Any = TrainingCheckpointCallback.save) -> None:
         original(callback)
-        if callback.model.num_timesteps >= 400:
+        if callback.model.num_timesteps >= 300:
             raise Killed
 
     monkeypatch.setattr(TrainingCheckpointCallback, "save", save)
@@ -92,14 +93,14 @@ def test_a_killed_run_goes_on_from_its_checkpoint_twice_alike(
         train.main(arguments(tmp_path))
     monkeypatch.undo()
     folder = tmp_path / "said" / f"{ENV}-delay2_1"
-    assert load_tree(folder / "checkpoint.zip")["counters"]["num_timesteps"] == 400
+    assert load_tree(folder / "checkpoint.zip")["counters"]["num_timesteps"] == 300
     copy = Path(shutil.copytree(folder, tmp_path / "copy"))
     for each in (folder, copy):
         train.main(["--resume", str(each)])
-        assert "at step 400" in capsys.readouterr().out
+        assert "at step 300" in capsys.readouterr().out
     assert_same_agents(folder, copy)
-    assert SAID.load(folder / f"{ENV}.zip").num_timesteps == 600
-    assert np.load(folder / "evaluations.npz")["timesteps"].tolist() == [300, 600]
+    assert SAID.load(folder / f"{ENV}.zip").num_timesteps == 400
+    assert np.load(folder / "evaluations.npz")["timesteps"].tolist() == [200, 400]
 
 
 # scripts/train.py with checkpoints of the planner every 10 updates, not 1,000, that kills itself at the 15th.

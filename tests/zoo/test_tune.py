@@ -136,10 +136,9 @@ def test_a_search_with_a_drawn_delay_or_vec_normalize(
     assert f"--delay {' '.join(map(str, delay))} -conf" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("storage", [[], ["--storage", "sqlite:///{}/study.db"]], ids=["journal", "sqlite"])
-def test_two_workers_share_a_study_and_train_no_depth_twice(run: Path, storage: list[str]) -> None:
+def test_two_workers_share_a_study_and_train_no_depth_twice(run: Path) -> None:
     grid = ["--depths", "2", "3", "--temperatures", "0", "1"]
-    command = [sys.executable, str(SCRIPT), "--run", str(run), *grid, *QUICK, *(word.format(run) for word in storage)]
+    command = [sys.executable, str(SCRIPT), "--run", str(run), *grid, *QUICK]
     environ = {**os.environ, "OMP_NUM_THREADS": "1"}
     workers = [
         subprocess.Popen(command, env=environ, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
@@ -151,7 +150,7 @@ def test_two_workers_share_a_study_and_train_no_depth_twice(run: Path, storage: 
     assert sum(out.count("Training the planner of depth 3") for out in outputs) == 1, outputs
     trials = results_of(run)["trials"]
     assert sorted((t["depth"], t["temperature"]) for t in trials) == [(2, 0.0), (2, 1.0), (3, 0.0), (3, 1.0)]
-    assert (run / "study.db" if storage else run / "tune" / "study.log").exists()
+    assert (run / "tune" / "study.log").exists()
     check_report(run)
 
 
