@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import math
 import platform
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from datetime import date
@@ -16,7 +16,7 @@ import torch as th
 
 from sb3_said.evaluation import Interval, bootstrap_interval
 from sb3_said.files import atomic as files
-from sb3_said.planner.precision import compute_dtype
+from sb3_said.planner.precision import has_bfloat16
 
 DTYPES = {"float32": th.float32, "bfloat16": th.bfloat16}
 
@@ -28,7 +28,23 @@ def parser(doc: str | None) -> argparse.ArgumentParser:
     made.add_argument("--rounds", type=int, help="turns of each variant; more make narrower intervals")
     made.add_argument("--device", default="cpu", help="torch device, such as cuda")
     made.add_argument("--json", type=Path, metavar="FILE", help="also write settings, machine and figures to FILE")
+    made.add_argument("--product-size", type=int, metavar="N", help="rows and columns of the matrices whose product "
+                      "gives the machine's rate; by default 2048, on a GPU 8192")  # fmt: skip
+    made.add_argument("--product-seconds", type=float, default=1.0, help="time to measure that rate for")
     return made
+
+
+def parse(made: argparse.ArgumentParser, argv: list[str] | None) -> argparse.Namespace:
+    """Read a command line and set the threads it asks for."""
+    args = made.parse_args(argv)
+    if args.num_threads:
+        th.set_num_threads(args.num_threads)
+    return args
+
+
+def progress(text: str) -> None:
+    """Say on stderr what is being measured; tables go to stdout."""
+    print(text, file=sys.stderr, flush=True)
 
 
 def turn_by_turn(
@@ -71,14 +87,15 @@ def ratio(slow: np.ndarray, fast: np.ndarray) -> Interval:
     return bootstrap_interval(slow / fast, np.median)
 
 
-def matmul_rate(dtype: str, device: str | th.device = "cpu", seconds: float = 1.0) -> float:
+def matmul_rate(dtype: str, device: str | th.device = "cpu", size: int | None = None, seconds: float = 1.0) -> float:
     """Return what this machine reaches in large square matrix products, the 95th percentile in FLOP/s.
 
-    :param dtype: ``"float32"`` or ``"bfloat16"``
+    :param dtype: ``"float32"`` or ``"bfloat16"``; emulated, without :func:`has_bfloat16`, it can take minutes
     :param device: to measure
-    :param seconds: to measure for
+    :param size: rows and columns; by default 2048, on a GPU 8192
+    :param seconds: to measure for, at least
     """
-    n = 2048 if th.device(device).type == "cpu" else 8192
+    n = size or (2048 if th.device(device).type == "cpu" else 8192)
     a, b = (th.randn(n, n, device=device).to(DTYPES[dtype]) for _ in range(2))
     out = th.empty_like(a)
     rounds = 3
@@ -89,18 +106,14 @@ def matmul_rate(dtype: str, device: str | th.device = "cpu", seconds: float = 1.
         rounds *= 2
 
 
-def matmul_rates(device: str | th.device = "cpu") -> dict[str, float]:
-    """Return :func:`matmul_rate` of every number format."""
-    return {dtype: matmul_rate(dtype, device) for dtype in DTYPES}
+def matmul_rates(args: argparse.Namespace) -> dict[str, float]:
+    """Return :func:`matmul_rate` of float32, and of bfloat16 where the device multiplies it in hardware.
 
-
-def dtype_name(precision: str, device: str | th.device, size: float = math.inf) -> str:
-    """Return the number format that a ``precision`` of ours stands for on a device, as :func:`matmul_rate` takes it.
-
-    :param size: as :func:`~sb3_said.planner.precision.compute_dtype` takes it
+    :param args: of :func:`parser`
     """
-    dtype = compute_dtype(precision, th.device(device), size)
-    return next(name for name, other in DTYPES.items() if other == dtype)
+    formats = ["float32"] + ["bfloat16"] * has_bfloat16(th.device(args.device))
+    progress(f"matrix products in {' and '.join(formats)}")
+    return {dtype: matmul_rate(dtype, args.device, args.product_size, args.product_seconds) for dtype in formats}
 
 
 def percentiles(seconds: np.ndarray) -> dict[str, float]:
@@ -124,6 +137,13 @@ def write_json(path: Path | None, args: argparse.Namespace, rows: Sequence[Mappi
     settings = {key: value for key, value in vars(args).items() if key != "json"}
     result = {"date": date.today().isoformat(), "settings": settings, "machine": machine(args.device)}
     files.write_json(path, {**result, "rows": list(rows), **more}, default=_plain)
+
+
+def report(args: argparse.Namespace, rows: list[dict[str, Any]], **more: Any) -> list[dict[str, Any]]:
+    """Print the table of ``rows``, write it with ``more`` where ``--json`` says, and return it."""
+    print_table(rows)
+    write_json(args.json, args, rows, **more)
+    return rows
 
 
 def machine(device: str | th.device = "cpu") -> dict[str, Any]:

@@ -1,11 +1,14 @@
 """The same planner written the plain way, as public diffusion planners are: what the benchmarks compare with.
 
-It follows CleanDiffuser's DiT pipelines, the code under the paper's results, in what costs time: eager float32,
-``nn.MultiheadAttention``, time embedding and adaLN modulations computed for every sample at every call, solver
-coefficients computed anew for every plan, an optimizer and an average of the weights that go parameter by parameter,
-windows fetched one by one, the loss read after every update. Shapes and arithmetic of the transformer are ours, so that
-both ways do the same work. Nothing is made slower than it is there; what never touches the result (an unused second
-network, logs of every denoising step) is left out.
+It follows CleanDiffuser's DiT pipelines, the code under the paper's results, in what costs time:
+
+- eager float32 and ``nn.MultiheadAttention``;
+- time embedding and adaLN modulations for every sample at every call, solver coefficients for every plan;
+- an optimizer and an average of the weights that go parameter by parameter;
+- windows fetched one by one, and the loss read after every update.
+
+Shapes and arithmetic of the transformer are ours, so that both ways do the same work. Nothing is slower here than it is
+there. What never touches the result (an unused second network, logs of every denoising step) is left out.
 """
 
 from __future__ import annotations
@@ -133,7 +136,7 @@ class WindowDataset(Dataset[dict[str, th.Tensor]]):
 def batches(dataset: WindowDataset, batch_size: int, num_workers: int = 0) -> Iterator[dict[str, th.Tensor]]:
     """Yield shuffled batches for ever.
 
-    :param num_workers: processes that fetch; the public code takes 4, which would take the cores from what is measured
+    :param num_workers: processes that fetch; the public code's 4 would take cores away from what is measured
     """
     loader = DataLoader(dataset, batch_size, shuffle=True, num_workers=num_workers, drop_last=True)
     while True:
@@ -219,15 +222,17 @@ class PlainPlanner:
         critic: ContinuousCritic,
         sampling_steps: int,
         n_candidates: int,
-        temperature: float = 0.5,
+        temperature: float,
+        scored: slice,
     ) -> np.ndarray:
-        """Return the best candidate's action, by the mean of min Q over the states after the decision: (B, act_dim).
+        """Return the action of the best candidate, by the mean of min Q over its scored states: (B, act_dim).
 
         One candidate is not scored.
 
         :param observation: (B, obs_dim) delayed observations
         :param action_history: (B, d, act_dim) actions sent since, oldest first
         :param critic: scores (state, action) pairs of the plan
+        :param scored: the states of a window that count
         """
         n, length = len(observation), len(self.known)
         prior = th.zeros(n * n_candidates, length, self.obs_dim + self.act_dim, device=self.device)
@@ -240,7 +245,6 @@ class PlainPlanner:
         states, actions = x[..., : self.obs_dim] * std + mean, x[..., self.obs_dim :].clamp(-1, 1)
         if n_candidates == 1:
             return actions[:, 0, self.delay].cpu().numpy()
-        future = slice(self.delay + 1, None)
-        values = th.cat(critic(states[:, :, future].flatten(0, 2), actions[:, :, future].flatten(0, 2)), dim=1)
+        values = th.cat(critic(states[:, :, scored].flatten(0, 2), actions[:, :, scored].flatten(0, 2)), dim=1)
         best = values.min(1).values.view(n, n_candidates, -1).mean(-1).argmax(1)
         return actions[th.arange(n, device=self.device), best, self.delay].cpu().numpy()

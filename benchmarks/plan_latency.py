@@ -7,30 +7,34 @@
 
 Hopper-v5's sizes at a delay of 8 steps, so windows of 16. Weights are random: they do not change the time.
 
-"ours" is ``model.predict(observation, deterministic=True)``. Its first call after ``model.warmup()`` is one of those
-that the percentiles are of. "plain" is benchmarks/plain.py; both run in turn, and "times as fast" is the median of the
-ratios turn by turn with its 95 % interval. "of the floor" is the part of our time that the matrix products alone would
-take, counted from their shapes, at the rate that large products of the same number format reach on this machine.
+"ours" is ``model.predict(observation, deterministic=True)``. The percentiles include its first call after
+``model.warmup()``. "plain" is benchmarks/plain.py, in float32. Both run in turn, and "times as fast" is the median of
+the ratios turn by turn with its 95 % interval. "of the floor" is the time of the matrix products alone over our time.
+The products are counted from their shapes, at the rate that large products of the same number format reach on this
+machine.
 
 A second table shows that cost is linear in candidates, denoising steps and environments: a line is fitted to the
-medians. "batched" are environments in one ``predict(..., deterministic=False)``; deterministic answers are made one by
-one, so that they do not depend on how many are asked for at once.
+medians. "batched" means all environments in one ``predict(..., deterministic=False)``. Deterministic answers are made
+one by one, so that they do not depend on the number of environments.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 import torch as th
-from measure import dtype_name, matmul_rate, parser, percentiles, print_table, ratio, turn_by_turn, write_json
+from measure import matmul_rates, parse, parser, percentiles, print_table, progress, ratio, turn_by_turn, write_json
 from plain import PlainPlanner
 from stable_baselines3 import SAC
 
 from sb3_said import SAID, DelayedObservationWrapper
+from sb3_said.planner import PlannerConfig
+from sb3_said.planner.precision import compute_dtype
 
 ENV = "Hopper-v5"
 HIDDEN = 256  # of the critics, two layers each: SB3's default
@@ -38,37 +42,45 @@ N_CRITICS = 2
 
 
 class Setting(NamedTuple):
-    """What a decision is made with."""
+    """What a decision is made with, at a delay that is the largest one, too."""
 
     name: str
-    depth: int
-    sampling_steps: int
-    n_candidates: int
+    config: PlannerConfig
     rounds: int
-    d_model: int = 256
-    horizon: int = 8
     delay: int = 8
 
     @property
-    def temperature(self) -> float:
-        """0, the default, where there is one candidate; then no critic is asked."""
-        return 0.5 if self.n_candidates > 1 else 0.0
+    def length(self) -> int:
+        """L, steps of a window."""
+        return self.delay + self.config.horizon
+
+    @property
+    def n_candidates(self) -> int:
+        """Windows that are denoised; at temperature 0 all would be the same, so one is."""
+        return self.config.n_candidates if self.config.temperature > 0 else 1
+
+    @property
+    def scored(self) -> slice:
+        """The states of a window that the critics score; one candidate is not scored."""
+        first = {"all": 1, "future": self.delay + 1, "decision": self.delay}[self.config.scored_states]
+        return slice(first, first + 1 if self.config.scored_states == "decision" else self.length)
 
 
+CPU = PlannerConfig(depth=2, d_model=128, sampling_steps=5, temperature=0.0)
+MANY = replace(CPU, n_candidates=16, temperature=0.5, scored_states="future")
 SETTINGS = (
-    Setting("paper", 8, 20, 50, rounds=20),
-    Setting("real time", 2, 5, 16, rounds=300),
-    Setting("--preset cpu, at the default temperature 0", 2, 5, 1, rounds=300, d_model=128),
-    Setting("real time, the width of --preset cpu", 2, 5, 16, rounds=300, d_model=128),
+    Setting("PlannerConfig.paper()", PlannerConfig.paper(), rounds=20),
+    Setting("16 candidates, width 256", replace(MANY, d_model=256), rounds=300),
+    Setting("--preset cpu", CPU, rounds=300),
+    Setting("--preset cpu with 16 candidates", MANY, rounds=300),
 )
-QUICK = Setting("quick", 1, 2, 4, rounds=3, d_model=32, horizon=2, delay=2)
+QUICK = Setting("quick", replace(MANY, depth=1, d_model=32, horizon=2, sampling_steps=2, n_candidates=4), 3, delay=2)
 
 
-def make_agent(setting: Setting, device: str, precision: str = "auto") -> SAID:
+def make_agent(setting: Setting, device: str) -> SAID:
     """Return an agent of random weights that answers with its planner."""
     env = DelayedObservationWrapper(gym.make(ENV), setting.delay)
-    planner = {key: getattr(setting, key) for key in ("depth", "sampling_steps", "n_candidates", "d_model", "horizon")}
-    planner |= {"precision": precision, "temperature": setting.temperature}
+    planner = setting.config.to_dict()
     model = SAID("MultiInputPolicy", env, seed=0, buffer_size=1_000, device=device, planner_kwargs=planner)
     for layer in (model.policy.planner.network.modulation, model.policy.planner.network.out):
         th.nn.init.normal_(layer.weight, std=0.02)  # zero before training, so that nothing would be computed
@@ -76,11 +88,11 @@ def make_agent(setting: Setting, device: str, precision: str = "auto") -> SAID:
     return model
 
 
-def make_plain(setting: Setting, device: str, action: gym.Space[Any], observation: gym.Space[Any]) -> Any:
+def make_plain(setting: Setting, device: str, env: gym.Env[Any, Any]) -> Any:
     """Return the plain planner's decision, with SB3's critics: maps observations to actions."""
-    obs_dim, act_dim = observation.shape[0], action.shape[0]  # type: ignore[index]
-    length = setting.delay + setting.horizon
-    planner = PlainPlanner(obs_dim, act_dim, setting.delay, length, setting.d_model, setting.depth, device=device)
+    obs_dim, act_dim = sizes(env)
+    config = setting.config
+    planner = PlainPlanner(obs_dim, act_dim, setting.delay, setting.length, config.d_model, config.depth, device=device)
     critic = SAC("MlpPolicy", gym.make(ENV), buffer_size=1_000, device=device).critic.requires_grad_(False)
 
     def decide(obs: dict[str, np.ndarray]) -> np.ndarray:
@@ -88,13 +100,19 @@ def make_plain(setting: Setting, device: str, action: gym.Space[Any], observatio
             obs["observation"][None],
             obs["action_history"][None],
             critic,
-            setting.sampling_steps,
+            config.sampling_steps,
             setting.n_candidates,
-            setting.temperature,
+            config.temperature,
+            setting.scored,
         )
 
     decide.planner = planner  # type: ignore[attr-defined]
     return decide
+
+
+def sizes(env: gym.Env[Any, Any]) -> tuple[int, int]:
+    """Return obs_dim and act_dim of a delayed task."""
+    return env.observation_space["observation"].shape[0], env.action_space.shape[0]  # type: ignore[index]
 
 
 def observe(env: gym.Env[Any, Any], delay: int) -> dict[str, np.ndarray]:
@@ -107,27 +125,35 @@ def observe(env: gym.Env[Any, Any], delay: int) -> dict[str, np.ndarray]:
 
 
 def matmul_flops(setting: Setting, obs_dim: int, act_dim: int) -> int:
-    """Count the floating-point operations of one decision's matrix products, two a weight and row."""
-    d, n, length = setting.d_model, setting.n_candidates, setting.delay + setting.horizon
+    """Count the floating-point operations of one decision's matrix products, two a weight and row.
+
+    What is computed once for all candidates is left out: it embeds the times and the known part.
+    """
+    d, n, length = setting.config.d_model, setting.n_candidates, setting.length
     weights = d * (3 * d + d + 4 * d + 4 * d)  # query, key and value; output of the attention; MLP
     attention = 2 * length * d  # a token's scores, and the mean of values
-    per_token = setting.depth * (weights + attention) + 2 * d * (obs_dim + act_dim)
-    scored = n * (setting.horizon - 1) if n > 1 else 0  # the states behind the decision
+    per_token = setting.config.depth * (weights + attention) + 2 * d * (obs_dim + act_dim)
+    scored = n * len(range(length)[setting.scored]) if n > 1 else 0
     critics = N_CRITICS * ((obs_dim + act_dim) * HIDDEN + HIDDEN * HIDDEN + HIDDEN)
-    return 2 * (setting.sampling_steps * n * length * per_token + scored * critics)
+    return 2 * (setting.config.sampling_steps * n * length * per_token + scored * critics)
 
 
-def measure_setting(setting: Setting, rounds: int, device: str) -> dict[str, Any]:
-    """Time our way and the plain way in turn, and return a row of the table."""
+def measure_setting(setting: Setting, rounds: int, device: str, rates: dict[str, float]) -> dict[str, Any]:
+    """Time our way and the plain way in turn, and return a row of the table.
+
+    :param rates: FLOP/s of large products, by number format
+    """
     model = make_agent(setting, device)
     env = model.get_env().envs[0]  # type: ignore[union-attr]
     obs = observe(env, setting.delay)
-    spaces = env.observation_space["observation"], env.action_space
-    plain = make_plain(setting, device, spaces[1], spaces[0])
-    size = setting.n_candidates * (setting.delay + setting.horizon) * setting.d_model
-    dtype = dtype_name(model.policy.planner.config.precision, model.device, size)
-    rate = matmul_rate(dtype, device)
+    plain = make_plain(setting, device, env)
+    config = setting.config
+    work = f"{config.sampling_steps} steps, {setting.n_candidates} candidate{'s' if setting.n_candidates > 1 else ''}"
+    name = f"{setting.name}: depth {config.depth}, width {config.d_model}, {work}"
+    size = setting.n_candidates * setting.length * config.d_model
+    dtype = str(compute_dtype(config.precision, model.device, size)).removeprefix("torch.")
 
+    progress(f"{rounds} turns of one decision, ours and plain: {name}")
     model.warmup()
     began = time.perf_counter()
     model.predict(obs, deterministic=True)
@@ -136,10 +162,9 @@ def measure_setting(setting: Setting, rounds: int, device: str) -> dict[str, Any
         {"ours": lambda: model.predict(obs, deterministic=True), "plain": lambda: plain(obs)}, rounds, device
     )
     ours = percentiles(np.append(seconds["ours"], first))
-    flops = matmul_flops(setting, spaces[0].shape[0], spaces[1].shape[0])
-    work = f"{setting.sampling_steps} steps, {setting.n_candidates} candidate{'s' if setting.n_candidates > 1 else ''}"
+    flops = matmul_flops(setting, *sizes(env))
     return {
-        "setting": f"{setting.name}: depth {setting.depth}, width {setting.d_model}, {work}",
+        "setting": name,
         "ours p50 ms": ours["p50_ms"],
         "p95": ours["p95_ms"],
         "p99": ours["p99_ms"],
@@ -147,9 +172,9 @@ def measure_setting(setting: Setting, rounds: int, device: str) -> dict[str, Any
         "plain p50 ms": percentiles(seconds["plain"])["p50_ms"],
         "times as fast": ratio(seconds["plain"], seconds["ours"]),
         "GFLOP": flops / 1e9,
-        "GFLOP/s, matrix product": rate / 1e9,
+        "GFLOP/s, matrix product": rates[dtype] / 1e9,
         "number format": dtype,
-        "of the floor": float(np.median(flops / rate / seconds["ours"])),
+        "of the floor": float(np.median(flops / rates[dtype] / seconds["ours"])),
     }
 
 
@@ -175,8 +200,9 @@ def measure_scaling(base: Setting, rounds: int, device: str) -> list[dict[str, A
         return lambda: model.predict(batch, deterministic=deterministic)
 
     def settings(key: str) -> dict[int, Callable[[], Any]]:
-        sizes = [getattr(base, key) * k for k in (1, 2, 3, 4)]
-        return {size: answers(make_agent(base._replace(**{key: size}), device), 1, True) for size in sizes}
+        values = [getattr(base.config, key) * k for k in (1, 2, 3, 4)]
+        changed = {value: base._replace(config=replace(base.config, **{key: value})) for value in values}
+        return {value: answers(make_agent(setting, device), 1, True) for value, setting in changed.items()}
 
     kinds = {
         "candidates": settings("n_candidates"),
@@ -186,6 +212,7 @@ def measure_scaling(base: Setting, rounds: int, device: str) -> list[dict[str, A
     }
     rows = []
     for kind, variants in kinds.items():
+        progress(f"{rounds} turns of one decision by {kind}: {', '.join(map(str, variants))}")
         seconds = turn_by_turn({str(size): variant for size, variant in variants.items()}, rounds, device)
         medians = [1e3 * float(np.median(seconds[str(size)])) for size in variants]
         line = fit_line(list(variants), medians)
@@ -202,27 +229,23 @@ def measure_scaling(base: Setting, rounds: int, device: str) -> list[dict[str, A
 
 
 def main(argv: list[str] | None = None) -> None:
+    """Measure, print and write."""
     p = parser(__doc__)
-    p.add_argument(
-        "--depth", type=int, help="blocks of the transformer; together with the next three: only this setting"
-    )
+    p.add_argument("--depth", type=int, help="blocks of the transformer; with the next three: only this setting")
     p.add_argument("--sampling-steps", type=int, default=5, help="with --depth")
     p.add_argument("--n-candidates", type=int, default=16, help="with --depth")
     p.add_argument("--d-model", type=int, default=256, help="with --depth")
     p.add_argument("--no-scaling", action="store_true", help="leave the second table out")
     p.add_argument("--quick", action="store_true", help="a tiny network and few turns: shows that it runs")
-    args = p.parse_args(argv)
-    if args.num_threads:
-        th.set_num_threads(args.num_threads)
+    args = parse(p, argv)
 
-    settings = SETTINGS
-    if args.quick:
-        settings = (QUICK,)
-    elif args.depth:
-        settings = (
-            Setting("own", args.depth, args.sampling_steps, args.n_candidates, rounds=50, d_model=args.d_model),
-        )
-    rows = [measure_setting(setting, args.rounds or setting.rounds, args.device) for setting in settings]
+    settings = (QUICK,) if args.quick else SETTINGS
+    if args.depth and not args.quick:
+        keys = ("depth", "sampling_steps", "n_candidates", "d_model")
+        own = replace(MANY, **{key: getattr(args, key) for key in keys})
+        settings = (Setting("own", own if args.n_candidates > 1 else replace(own, temperature=0.0), rounds=50),)
+    rates = matmul_rates(args)
+    rows = [measure_setting(setting, args.rounds or setting.rounds, args.device, rates) for setting in settings]
     print_table(rows)
     scaling = []
     if not args.no_scaling:

@@ -4,10 +4,10 @@
     python benchmarks/replay_memory.py --obs-dim 11 --act-dim 3 --delay 0 4 16
 
 Random episodes of a delayed task of Ant-v5's sizes go into both buffers, which then return the same: delayed
-observation, action history, age and true state, before and after the step. "GB / 1 M" counts the arrays that a buffer
-holds once it is full, scaled to a million transitions; "RSS" is what the process grew by while one was filled, scaled
-alike (Linux; rough, as it holds all else that was allocated meanwhile). Sampling is timed turn by turn, on one thread;
-"times SB3" is the median of the ratios of the rates, with its 95 % interval.
+observation, action history, age and true state, before and after the step. "GB / 1 M" counts the arrays of a full
+buffer, scaled to a million transitions. "RSS / 1 M" is the growth of the process while a buffer was filled, scaled
+alike (Linux; rough, since it holds all else that was allocated meanwhile). Sampling is timed turn by turn, on one
+thread. "times SB3" is the median of the ratios of the rates, with its 95 % interval: above 1 is faster than SB3's.
 """
 
 from __future__ import annotations
@@ -20,9 +20,8 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import torch as th
 from gymnasium import spaces
-from measure import parser, percentiles, print_table, ratio, turn_by_turn, write_json
+from measure import parse, parser, percentiles, progress, ratio, report, turn_by_turn
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 
 from sb3_said import DelayedObservationWrapper
@@ -96,6 +95,7 @@ def measure(delay: int, args: argparse.Namespace) -> list[dict[str, Any]]:
     env = DelayedObservationWrapper(RandomTask(args.obs_dim, args.act_dim), delay=delay)
     buffers, resident = {}, {}
     for name, cls in (("SB3's", DictReplayBuffer), ("ours", DelayedReplayBuffer)):
+        progress(f"filling {name} buffer with {args.rows} transitions at delay {delay}")
         before = resident_bytes()
         buffers[name] = make_buffer(cls, env, args.rows)
         fill(buffers[name], env)
@@ -104,6 +104,7 @@ def measure(delay: int, args: argparse.Namespace) -> list[dict[str, Any]]:
         name: lambda b=buffer: [b.sample(args.batch_size) for _ in range(SAMPLES_PER_TURN)]
         for name, buffer in buffers.items()
     }
+    progress(f"{args.rounds} turns of {SAMPLES_PER_TURN} samples")
     seconds = turn_by_turn(variants, args.rounds)
     scale = MILLION / args.rows / 1e9
     return [
@@ -129,12 +130,8 @@ def main(argv: list[str] | None = None) -> list[dict[str, Any]]:
     p.add_argument("--batch-size", type=int, default=256)
     p.add_argument("--rows", type=int, default=50_000, help="transitions in each buffer")
     p.set_defaults(num_threads=1, rounds=40)
-    args = p.parse_args(argv)
-    th.set_num_threads(args.num_threads)
-    rows = [row for delay in args.delay for row in measure(delay, args)]
-    print_table(rows)
-    write_json(args.json, args, rows)
-    return rows
+    args = parse(p, argv)
+    return report(args, [row for delay in args.delay for row in measure(delay, args)])
 
 
 if __name__ == "__main__":

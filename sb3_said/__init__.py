@@ -24,12 +24,13 @@ __all__ = [
     "PlannerConfig",
     "PlannerTrainingCallback",
 ]
-_FOLDERS = ("delays", "planner", "sac", "said")  # each after those it imports
+_HOMES = ("delays", "planner", "sac", "said")  # of these names, each after those it imports
+_FOLDERS = (*_HOMES, "replay", "files", "evaluation", "zoo")
 
 
 def __getattr__(name: str) -> Any:
     if name in __all__:
-        folders = (import_module(f"{__name__}.{folder}") for folder in _FOLDERS)
+        folders = (import_module(f"{__name__}.{folder}") for folder in _HOMES)
         return next(getattr(folder, name) for folder in folders if name in folder.__all__)
     if name in _FOLDERS:
         return import_module(f"{__name__}.{name}")

@@ -9,34 +9,31 @@ from dataclasses import dataclass
 import numpy as np
 
 from sb3_said.delays.processes import (
-    DelayProcess,
-    age_range,
-    as_int,
-    check_count,
-    check_draw,
+    Delay,
+    as_process,
     check_probability,
-    checked,
-    make_process,
+    checked_count,
     packet_delays,
+    smallest_age,
 )
 
 
 @dataclass(frozen=True)
 class _OfProcess:
-    """What processes made of one other process share."""
+    """A process made of one other process."""
 
-    process: int | tuple[int, int] | DelayProcess
+    process: Delay
 
     def __post_init__(self) -> None:
-        make_process(self.process)
+        object.__setattr__(self, "process", as_process(self.process))
 
     @property
     def min_delay(self) -> int:
-        return age_range(self.process)[0]
+        return smallest_age(self.process)
 
     @property
     def max_delay(self) -> int:
-        return age_range(self.process)[1]
+        return as_process(self.process).max_delay
 
 
 @dataclass(frozen=True)
@@ -44,11 +41,11 @@ class HeldDelay(_OfProcess):
     """A delay that stays for a while: another process, asked anew only at times.
 
     ``HeldDelay(UniformDelay(min_lag, max_lag), hold_prob, update_period)`` draws as the delay buffers of Isaac Lab and
-    mjlab do (there ``update_period=0`` says every step, and the lag is 0 until the first update).
+    mjlab do (there ``update_period=0`` means every step, and the lag is 0 until the first update).
 
-    :param process: draws a new delay when one is due; one that draws a delay for an episode does so each time
+    :param process: draws a new delay when one is due; a process with one delay for an episode draws anew each time
     :param hold_prob: probability to keep the last delay when a new one is due
-    :param update_period: a new delay is due every so many packets; the phase is drawn at every reset
+    :param update_period: packets from one draw to the next; the phase is drawn at every reset
     :raises ValueError: for a probability outside 0..1 or a period below 1
     """
 
@@ -58,8 +55,7 @@ class HeldDelay(_OfProcess):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_probability("hold_prob", self.hold_prob)
-        check_count("update_period", self.update_period, 1)
-        as_int(self, "update_period")
+        object.__setattr__(self, "update_period", checked_count("update_period", self.update_period, 1))
 
     def sample(self, rng: np.random.Generator) -> Iterator[int | None]:
         delays = self._draws(rng)
@@ -71,13 +67,12 @@ class HeldDelay(_OfProcess):
                 delay = next(delays)
 
     def _draws(self, rng: np.random.Generator) -> Iterator[int | None]:
-        process = make_process(self.process)
-        while True:  # what draws without an end never comes back here
-            drawn = process.sample(rng)
-            if isinstance(drawn, Iterator):
-                yield from checked(process, drawn)
+        while True:
+            delays = packet_delays(self.process, rng)
+            if isinstance(delays, itertools.repeat):
+                yield next(delays)
             else:
-                yield check_draw(drawn, process, process.max_delay)
+                yield from delays  # without an end
 
 
 @dataclass(frozen=True)
@@ -95,22 +90,21 @@ class PeriodicPackets(_OfProcess):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_count("period", self.period, 1)
-        as_int(self, "period")
+        object.__setattr__(self, "period", checked_count("period", self.period, 1))
 
     @property
     def max_delay(self) -> int:
         return super().max_delay + self.period - 1
 
     def sample(self, rng: np.random.Generator) -> Iterator[int | None]:
-        for delay in packet_delays(make_process(self.process), rng):
+        for delay in packet_delays(self.process, rng):
             yield from itertools.repeat(None, self.period - 1)
             yield delay
 
 
 @dataclass(frozen=True)
 class DroppedPackets(_OfProcess):
-    """Packets of another process that get lost, each with probability ``p``.
+    """Packets of another process, each lost with probability ``p``.
 
     Ages are bounded: where losses in a row would make the newest observation older than ``max_delay``, the packet of
     that age is delivered after all, and counted in ``info["forced_deliveries"]``.
@@ -130,15 +124,14 @@ class DroppedPackets(_OfProcess):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_probability("p", self.p)
-        check_count("max_losses", self.max_losses, 1)
-        as_int(self, "max_losses")
+        object.__setattr__(self, "max_losses", checked_count("max_losses", self.max_losses, 1))
 
     @property
     def max_delay(self) -> int:
         return super().max_delay + self.max_losses
 
     def sample(self, rng: np.random.Generator) -> Iterator[int | None]:
-        for delay in packet_delays(make_process(self.process), rng):
+        for delay in packet_delays(self.process, rng):
             yield None if rng.random() < self.p else delay
 
 
@@ -146,44 +139,44 @@ class DroppedPackets(_OfProcess):
 class TotalDelay:
     """Observation delay plus action delay: ``delay`` and ``action_delay`` of the wrapper in one, as on a command line.
 
-    An action that takes k steps to the actuator meets the state k steps on. Seen from the actuator, the action is
-    executed as it is chosen, and observations are k steps older: which of the two is delayed makes no difference, as
-    long as all actions of an episode take equally long.
+    An action that takes k steps to the actuator meets the state k steps on. On the actuator's clock, each action is
+    executed as it is chosen, and observations are k steps older. As long as all actions of an episode take equally
+    long, an agent cannot tell which of the two is delayed.
 
     :param observation: delays of observations
     :param action: delays of actions
     """
 
-    observation: int | tuple[int, int] | DelayProcess
-    action: int | tuple[int, int] | DelayProcess
+    observation: Delay
+    action: Delay
 
     def __post_init__(self) -> None:
-        make_process(self.observation), make_process(self.action)
+        object.__setattr__(self, "observation", as_process(self.observation))
+        object.__setattr__(self, "action", as_process(self.action))
 
     @property
     def min_delay(self) -> int:
-        return age_range(self.observation)[0] + age_range(self.action)[0]
+        return smallest_age(self.observation) + smallest_age(self.action)
 
     @property
     def max_delay(self) -> int:
-        return age_range(self.observation)[1] + age_range(self.action)[1]
+        return as_process(self.observation).max_delay + as_process(self.action).max_delay
 
     @property
     def action_varies(self) -> bool:
         """Whether every action takes a time of its own, which only the wrapper can act out."""
-        return isinstance(make_process(self.action).sample(np.random.default_rng(0)), Iterator)
+        return isinstance(as_process(self.action).sample(np.random.default_rng(0)), Iterator)
 
     def sample(self, rng: np.random.Generator) -> Iterator[int | None]:
         """Draw the observation delays from ``rng``, as they are without action delay, the action delay from a child.
 
         :raises ValueError: for an action process that draws anew for every packet
         """
-        action, observation = make_process(self.action), make_process(self.observation)
-        added = action.sample(rng.spawn(1)[0])
-        if isinstance(added, Iterator):
+        added = packet_delays(self.action, rng.spawn(1)[0])
+        if not isinstance(added, itertools.repeat):
             raise ValueError(
-                f"{action} draws a delay for every action, which is more than an age of observations can tell; give "
+                f"{self.action} draws a delay for every action, which the age of observations cannot express; give "
                 "TotalDelay to DelayedObservationWrapper as it is, not inside another process."
             )
-        k = check_draw(added, action, action.max_delay)
-        return (None if delay is None else delay + k for delay in packet_delays(observation, rng))
+        k = next(added)
+        return (None if delay is None else delay + k for delay in packet_delays(self.observation, rng))

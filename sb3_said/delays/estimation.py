@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 N_FOLDS = 5  # of the held-out predictions
-MAX_BLOCKS = 100  # consecutive rows that are held out, and resampled, together
-ROWS_PER_FEATURE = 4  # fewer say nothing, held out
+MAX_BLOCKS = 100  # a block is a run of rows; it is held out and resampled as a whole
+ROWS_PER_FEATURE = 4  # with fewer, held-out predictions are noise
 MIN_ROWS = 50  # fewer make too few blocks to resample: unrelated data could look certain
-ROUNDING = 1e-8  # a channel that moves by less of its size than this stands still
+ROUNDING = 1e-8  # a channel stands still if it moves by less than this part of its size
 
 
 @dataclass(frozen=True)
@@ -20,9 +20,10 @@ class DelayEstimate:
 
     :param delay: the age with the highest score, in control steps; the most frequent age where it varies
     :param confidence: fraction of resampled logs in which the same age has the highest score, and one above 0
-    :param scores: (max_delay + 1,), for each age the held-out share of the change from one observation to the next that
-        the action of that age explains beyond what earlier observations do: at most 1, and about 0 or below for an age
-        that does not occur. Where the delay varies, the scores are about in proportion to how often each age occurs.
+    :param scores: (max_delay + 1,), a score for each age: the part of the held-out change from one observation to the
+        next that the action of that age explains, beyond what earlier observations explain. It is at most 1, and about
+        0 or below for an age that does not occur. Where the delay varies, it is about in proportion to how often each
+        age occurs.
     """
 
     delay: int
@@ -40,19 +41,19 @@ def estimate_delay(
 ) -> DelayEstimate:
     """Find how many control steps a logged system's observations are old.
 
-    At age d the change from o_t to o_{t+1} is the doing of a_{t-d}. So the change and each of the actions
-    a_t, a_{t-1}, ..., a_{t-max_delay} are predicted from o_t and o_{t-1} by ridge regression, and the age is taken at
-    which what remains of the action best explains what remains of the change (the rise of R^2, on held-out blocks).
-    A channel that echoes the command counts like any other. Rows without a new observation are left out.
+    At age d the action a_{t-d} makes the change from o_t to o_{t+1}. Ridge regression predicts that change, and each of
+    the actions a_t, a_{t-1}, ..., a_{t-max_delay}, from o_t and o_{t-1}. The residual of the right action explains most
+    of the residual of the change (by the rise of R^2, on held-out blocks), and its age is the delay. A channel that
+    echoes the command counts like any other. Rows without a new observation are left out.
 
-    The actions must hold something that the observations do not tell: random actions, noise, or a task that keeps
-    moving. Observation and action delay cannot be told apart: their sum is found. An age equal to ``max_delay`` may be
-    a larger one: ask again with a larger ``max_delay``.
+    The observations must not determine the actions: log random actions, noise, or a task that keeps moving. Observation
+    and action delay cannot be told apart, so their sum is found. An age equal to ``max_delay`` may stand for a larger
+    one: ask again with a larger ``max_delay``.
 
     :param observations: for each episode (T + 1, obs_dim), as they arrived
     :param actions: for each episode (T, act_dim): action t was sent after observation t had arrived
-    :param max_delay: largest age that is tried, in control steps
-    :param n_resamples: resampled logs, for the confidence
+    :param max_delay: largest age to try, in control steps
+    :param n_resamples: logs to resample for the confidence
     :param seed: of the resampling
     :raises ValueError: for arrays that do not fit together or are not finite, observations or actions that never
         change by more than rounding, or too little data
@@ -78,7 +79,10 @@ def estimate_delay(
             f"needed for {change.shape[1]} observation and {lagged.shape[2]} action entries that vary."
         )
     if change.shape[1] == 0:
-        raise ValueError("The observations change by the same at every step, which tells nothing of the actions.")
+        raise ValueError(
+            "The observations change by the same at every step, which tells nothing of the actions; log the system "
+            "while different actions move it."
+        )
     block = np.arange(n_rows) * min(MAX_BLOCKS, n_rows // 5) // n_rows  # (N,)
     gains = _held_out_gains(before, change, lagged, block % N_FOLDS)  # (N, max_delay + 1)
     of_blocks = np.stack([np.bincount(block, gain) for gain in gains.T], axis=1)  # (n_blocks, max_delay + 1)
@@ -95,9 +99,13 @@ def estimate_delay(
 def _rows(
     observations: Sequence[np.ndarray], actions: Sequence[np.ndarray], max_delay: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (o_t, o_t - o_{t-1}, 1), o_{t+1} - o_t and a_t, ..., a_{t-max_delay}, all standardised, of the steps that
-    brought a new observation: (N, features), (N, obs_dim), (max_delay + 1, N, act_dim). Actions before the episode are
-    the mean action."""
+    """Return the standardised rows of the N steps that brought a new observation.
+
+    Actions before the episode are the mean action.
+
+    :return: (o_t, o_t - o_{t-1}, 1), (N, features); o_{t+1} - o_t, (N, obs_dim); and a_t, ..., a_{t-max_delay},
+        (max_delay + 1, N, act_dim)
+    """
     before, change, lagged = [], [], []
     all_sent = np.concatenate(actions)
     mean, scale, varies = all_sent.mean(0), all_sent.std(0), _varies(all_sent)  # (act_dim,) each
@@ -131,20 +139,24 @@ def _varies(x: np.ndarray) -> np.ndarray:
 
 
 def _held_out_gains(x: np.ndarray, y: np.ndarray, lagged: np.ndarray, fold: np.ndarray) -> np.ndarray:
-    """Return for each row and age by how much the action lowers the squared error of the change, mean over channels:
-    (N, max_delay + 1). The change has variance 1, so the mean over rows is the rise of R^2."""
+    """Return by how much each age's action lowers the squared error of the change, mean over channels.
+
+    The change has variance 1, so the mean over rows is the rise of R^2.
+
+    :return: (N, max_delay + 1)
+    """
     gains = np.zeros((len(y), len(lagged)))
     for k in range(N_FOLDS):
         kept, held = fold != k, fold == k
-        y_left, *lagged_left = _left(x, [y, *lagged], kept)
+        y_left, *lagged_left = _residuals(x, [y, *lagged], kept)
         for age, a_left in enumerate(lagged_left):
-            (error,) = _left(a_left, [y_left], kept)  # (N, obs_dim)
+            (error,) = _residuals(a_left, [y_left], kept)  # (N, obs_dim)
             gains[held, age] = (y_left[held] ** 2 - error[held] ** 2).mean(1)
     return gains
 
 
-def _left(x: np.ndarray, targets: list[np.ndarray], kept: np.ndarray) -> list[np.ndarray]:
-    """Return what a ridge regression on x, fitted to the rows kept, leaves of each target."""
+def _residuals(x: np.ndarray, targets: list[np.ndarray], kept: np.ndarray) -> list[np.ndarray]:
+    """Return each target's residual in a ridge regression on x, fitted to the rows kept."""
     gram = x[kept].T @ x[kept] + np.eye(x.shape[1])
     return [y - x @ np.linalg.solve(gram, x[kept].T @ y[kept]) for y in targets]
 

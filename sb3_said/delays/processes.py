@@ -1,7 +1,7 @@
-"""How long packets take: delay processes for observations and for actions, seeded by whoever owns them.
+"""Delay processes: how long the packets of an episode take, for observations and for actions.
 
-A process is an immutable description. It can be shared between environments and compared; all that changes within an
-episode is in the iterator that ``sample`` returns.
+A process is an immutable description, so environments can share it and tests can compare it. The iterator that
+``sample`` returns holds what changes within an episode; the caller's generator gives the random numbers.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 class DelayProcess(Protocol):
     """Draws how many control steps the packets of an episode take.
 
-    A ``min_delay`` beside ``max_delay``, the smallest age amid an episode, is optional: see :func:`age_range`.
+    ``min_delay``, the smallest age amid an episode, is optional: see :func:`smallest_age`.
     """
 
     @property
@@ -31,6 +31,10 @@ class DelayProcess(Protocol):
         :return: one integer for all packets of the episode, or an iterator over the delays of the packets sent at
             steps 1, 2, ..., with None for a packet that never arrives
         """
+
+
+#: What a user may write where a process is expected; text is read in ``text.py``.
+Delay = int | Sequence[int] | DelayProcess
 
 
 @dataclass(frozen=True)
@@ -46,7 +50,7 @@ class FixedDelay:
     def __post_init__(self) -> None:
         if not (_is_integer(self.delay) and self.delay >= 0):
             raise ValueError(f"A delay is a whole number of control steps >= 0, got {self.delay}.")
-        as_int(self, "delay")
+        object.__setattr__(self, "delay", int(self.delay))
 
     @property
     def min_delay(self) -> int:
@@ -62,7 +66,7 @@ class FixedDelay:
 
 @dataclass(frozen=True)
 class _Range:
-    """What processes over ``low..high`` share."""
+    """A process over ``low..high``."""
 
     low: int
     high: int
@@ -72,7 +76,8 @@ class _Range:
             raise ValueError(
                 f"A delay range is (low, high), whole numbers with 0 <= low <= high, got ({self.low}, {self.high})."
             )
-        as_int(self, "low", "high")
+        object.__setattr__(self, "low", int(self.low))
+        object.__setattr__(self, "high", int(self.high))
 
     @property
     def min_delay(self) -> int:
@@ -98,12 +103,7 @@ class EpisodeDelay(_Range):
 
 @dataclass(frozen=True)
 class UniformDelay(_Range):
-    """A delay drawn uniformly from ``low..high`` (both included) for every packet.
-
-    :param low: smallest delay, in control steps, >= 0
-    :param high: largest delay, in control steps, >= low
-    :raises ValueError: for a negative, fractional or empty range
-    """
+    """A delay drawn uniformly from ``low..high`` (both included) for every packet; else as :class:`EpisodeDelay`."""
 
     def sample(self, rng: np.random.Generator) -> Iterator[int]:
         while True:
@@ -169,10 +169,10 @@ WIFI_20MS = DistributionDelay((0.0, 0.3082, 0.5927, 0.0829, 0.0075, 0.0031, 0.00
 class RandomWalkDelay(_Range):
     """A delay that drifts: one step up or down with probability ``move_prob``, starting anywhere in ``low..high``.
 
-    A move out of the range is not made, so that all delays are equally frequent in the long run.
+    It stays where a move would leave the range, so that all delays are equally frequent in the long run.
 
-    :param low: smallest delay, in control steps, >= 0
-    :param high: largest delay, in control steps, >= low
+    :param low: as of :class:`EpisodeDelay`
+    :param high: as of :class:`EpisodeDelay`
     :param move_prob: probability that the delay moves between one packet and the next, half of it upwards
     :raises ValueError: for a negative, fractional or empty range, or a probability outside 0..1
     """
@@ -212,21 +212,16 @@ def in_steps(milliseconds: float | np.ndarray, control_period: float) -> int | n
     return int(steps) if steps.ndim == 0 else steps
 
 
-def make_process(delay: int | Sequence[int] | str | DelayProcess) -> DelayProcess:
-    """Turn what a user writes as ``delay`` into a process.
+def as_process(delay: Delay) -> DelayProcess:
+    """Make a process of a number or a pair; return a process as it is.
 
-    :param delay: an integer (fixed), a ``(low, high)`` pair (drawn anew each episode), a process, or any of these as
-        text (:func:`~sb3_said.delays.written.parse_process`)
+    :param delay: an integer (fixed), a ``(low, high)`` pair (drawn anew each episode), or a process
     :raises ValueError: for anything else
     """
-    if isinstance(delay, str):
-        from sb3_said.delays.written import parse_process  # which knows the processes made of processes, too
-
-        delay = parse_process(delay)
     if _is_integer(delay):
-        return FixedDelay(int(delay))  # type: ignore[arg-type]
-    if isinstance(delay, (tuple, list)) and len(delay) == 2 and all(_is_integer(x) for x in delay):
-        return EpisodeDelay(int(delay[0]), int(delay[1]))
+        return FixedDelay(delay)  # type: ignore[arg-type]
+    if isinstance(delay, (tuple, list)) and len(delay) == 2 and all(map(_is_integer, delay)):
+        return EpisodeDelay(*delay)
     if hasattr(delay, "sample") and hasattr(delay, "max_delay"):
         return delay
     raise ValueError(
@@ -235,69 +230,58 @@ def make_process(delay: int | Sequence[int] | str | DelayProcess) -> DelayProces
     )
 
 
-def age_range(process: int | Sequence[int] | str | DelayProcess) -> tuple[int, int]:
-    """Return the smallest and the largest age that a process brings amid an episode, in control steps.
+def smallest_age(delay: Delay) -> int:
+    """Return the smallest age amid an episode, in control steps: 0 for a user's own process without ``min_delay``.
 
-    An episode's start has smaller ones. A user's own process without ``min_delay`` may bring any up to ``max_delay``.
+    An episode's start has smaller ones.
     """
-    process = make_process(process)
-    return getattr(process, "min_delay", 0), process.max_delay
+    return getattr(as_process(delay), "min_delay", 0)
 
 
-def packet_delays(process: DelayProcess, rng: np.random.Generator) -> Iterator[int | None]:
-    """Draw an episode from a process: the delays of the packets sent at steps 1, 2, ...; None for one that is lost.
+def packet_delays(delay: Delay, rng: np.random.Generator) -> Iterator[int | None]:
+    """Draw an episode: the delays of the packets sent at steps 1, 2, ...; None for one that is lost.
 
-    :raises ValueError: when the process draws anything but integers in 0..max_delay, at once or on the way
+    :return: an ``itertools.repeat`` where all packets of the episode take equally long
+    :raises ValueError: when the process draws anything but integers in 0..max_delay, or when its delays end; at once,
+        or when the draw is reached
     """
+    process = as_process(delay)
     drawn = process.sample(rng)
     if isinstance(drawn, Iterator):
-        return checked(process, drawn)
-    return itertools.repeat(check_draw(drawn, process, process.max_delay))
+        return _checked(process, drawn)
+    return itertools.repeat(_checked_draw(process, drawn, process.max_delay))
 
 
-def checked(process: DelayProcess, delays: Iterator[int | None]) -> Iterator[int | None]:
-    """Yield the delays that a process draws for an episode.
-
-    :raises ValueError: on the way, for anything but integers in 0..max_delay, or when they end
-    """
+def _checked(process: DelayProcess, delays: Iterator[int | None]) -> Iterator[int | None]:
     max_delay = process.max_delay
     for delay in delays:
-        yield None if delay is None else check_draw(delay, process, max_delay)
+        yield None if delay is None else _checked_draw(process, delay, max_delay)
     raise ValueError(f"{process!r} ran out of delays amid an episode; its iterator must have no end.")
 
 
-def check_draw(delay: int, process: DelayProcess, max_delay: int) -> int:
-    """Return a delay that a process drew.
-
-    :raises ValueError: unless it is an integer in 0..max_delay
-    """
+def _checked_draw(process: DelayProcess, delay: int, max_delay: int) -> int:
     if not (_is_integer(delay) and 0 <= delay <= max_delay):
         raise ValueError(f"{process!r} drew a delay of {delay}, expected a whole number in 0..{max_delay}.")
     return int(delay)
 
 
 def check_probability(name: str, p: float) -> None:
-    """Refuse what is no probability.
+    """Refuse a number outside 0..1.
 
-    :raises ValueError: saying what was given
+    :raises ValueError: with the number
     """
     if not 0.0 <= p <= 1.0:
         raise ValueError(f"{name} is a probability in 0..1, got {p}.")
 
 
-def check_count(name: str, n: int, smallest: int) -> None:
-    """Refuse what is no integer, or a too small one.
+def checked_count(name: str, n: int, smallest: int) -> int:
+    """Return a whole number as Python's own ``int``; ``in_steps`` returns NumPy's.
 
-    :raises ValueError: saying what was given
+    :raises ValueError: for anything but a whole number of at least ``smallest``
     """
     if not (_is_integer(n) and n >= smallest):
         raise ValueError(f"{name} is a whole number >= {smallest}, got {n}.")
-
-
-def as_int(process: object, *names: str) -> None:
-    """Make whole numbers of NumPy, which ``in_steps`` returns, Python's own, in an immutable process."""
-    for name in names:
-        object.__setattr__(process, name, int(getattr(process, name)))
+    return int(n)
 
 
 def _is_integer(x: object) -> bool:

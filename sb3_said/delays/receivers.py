@@ -1,7 +1,8 @@
-"""What a receiver holds at every step: the age of the newest packet, given how long packets take."""
+"""What a receiver holds at every step, and what an actuator executes, given how long packets take."""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
 
 import numpy as np
@@ -10,7 +11,7 @@ from sb3_said.delays.processes import DelayProcess, packet_delays
 
 
 class NewestPacket:
-    """Keeps the newest packet that has arrived; one that a younger packet has overtaken is of no use.
+    """Keeps the newest packet that has arrived, and drops one that a younger packet has overtaken.
 
     Packet t is sent at step t and arrives at t + its delay; packet 0 is there from the start. The age grows by at most
     one a step and can fall by any amount. It never exceeds the process's ``max_delay``: where losses would make it, the
@@ -42,41 +43,76 @@ class NewestPacket:
         :raises ValueError: when the process draws a delay outside 0..max_delay
         """
         self._step += 1
-        n_slots = len(self._arriving)
-        delay = next(self._delays)
-        if delay is not None:
-            self._arriving[(self._step + delay) % n_slots] = self._step
-        self._newest = max(self._newest, self._arriving[self._step % n_slots])
-        if self._step - self._newest == n_slots:
+        self._newest = self._read(next(self._delays))
+        if self._step - self._newest == len(self._arriving):
             self._newest += 1
             self.forced_deliveries += 1
         return self._step - self._newest
 
+    def _read(self, delay: int | None) -> int:
+        """Send the packet of this step, and return the number of the packet that is held now."""
+        n_slots = len(self._arriving)
+        if delay is not None:
+            self._arriving[(self._step + delay) % n_slots] = self._step
+        return max(self._newest, self._arriving[self._step % n_slots])
+
 
 class IndependentDraw(NewestPacket):
-    """Reads a buffer at an age drawn for every step, as the DOMDP of the paper (section 2) has it.
+    """Reads a buffer at an age drawn for every step, as the DOMDP of the paper (section 2) does.
 
-    An older observation may follow a younger one, which no receiver that keeps the newest packet would hand out. A
-    lost draw leaves the observation that was read last.
+    An older observation may follow a younger one; under :class:`NewestPacket` it never does. A lost draw leaves the
+    observation that was read last.
 
     :param process: the age to read at each step
     """
 
-    def step(self) -> int:
-        """Draw the next age.
-
-        :return: the age of the observation read, in control steps
-        :raises ValueError: when the process draws a delay outside 0..max_delay
-        """
-        self._step += 1
-        delay = next(self._delays)
-        if delay is not None:
-            self._newest = max(self._step - delay, 0)
-        elif self._step - self._newest == len(self._arriving):
-            self._newest += 1
-            self.forced_deliveries += 1
-        return self._step - self._newest
+    def _read(self, delay: int | None) -> int:
+        return self._newest if delay is None else max(self._step - delay, 0)
 
 
 #: What a user may write as ``receiver``.
 RECEIVERS = {"newest": NewestPacket, "independent": IndependentDraw}
+
+
+class Actuator:
+    """Executes the newest action that has arrived, and holds it until another arrives.
+
+    The task starts when the first action arrives, so that action is there from the start, as s_0 is for observations.
+
+    :param receiver: of actions; it gives the age of the action to execute
+    :param memory: steps for which it remembers what it executed: the largest age of an observation
+    """
+
+    def __init__(self, receiver: NewestPacket, memory: int):
+        self.receiver = receiver
+        self._sent: deque[np.ndarray] = deque(maxlen=int(receiver.process.max_delay) + 1)
+        self._ages: deque[int] = deque(maxlen=int(memory) + 1)  # of what was executed in the newest steps
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Start an episode.
+
+        :param rng: of the action delays, until the next reset
+        """
+        self.receiver.reset(rng)
+        self._sent.clear()
+        self._ages.clear()
+
+    def execute(self, action: np.ndarray) -> np.ndarray:
+        """Send an action to the actuator.
+
+        :param action: (act_dim,)
+        :return: the action that is executed in this step, sent now or earlier
+        """
+        age = self.receiver.step() if self._sent else 0
+        self._sent.append(np.array(action))
+        self._ages.append(age)
+        return self._sent[-1 - age]
+
+    def lag(self, age: int) -> int:
+        """Return how many actions, sent before a state, do not show in it yet.
+
+        That is the age of the action whose execution led to the state. No action leads to s_0.
+
+        :param age: of the state, in control steps
+        """
+        return self._ages[-1 - age] if age < len(self._ages) else 0

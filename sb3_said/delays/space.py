@@ -1,41 +1,86 @@
-"""The observation space of a delayed task: its keys, what fits it, and the ages that come with it."""
+"""The observation space of a delayed task: its keys, how to build and to read it, and the ages that come with it."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from gymnasium import spaces
 
+#: Keys of every delayed observation, and those that ``state_history=True`` adds.
+KEYS = ("observation", "action_history", "delay")
+STATE_KEYS = ("state_history", "state_known")
 #: Key of the true state in ``info`` and in sampled observations; never part of an environment's observation space.
 UNDELAYED = "undelayed_observation"
 #: Key in ``info`` of what the task was given, where that is not the action sent last.
 EXECUTED = "executed_action"
 
 
+def check_task(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> tuple[spaces.Box, spaces.Box]:
+    """Return the spaces of a task without delay as the Boxes that they have to be.
+
+    :raises ValueError: unless observations are a 1-D Box, and actions a 1-D Box with finite bounds that differ
+    """
+    if not (isinstance(observation_space, spaces.Box) and len(observation_space.shape) == 1):
+        raise ValueError(
+            f"Expected a 1-D Box observation, got {observation_space}; wrap the task in "
+            "gymnasium.wrappers.FlattenObservation first."
+        )
+    if not (isinstance(action_space, spaces.Box) and len(action_space.shape) == 1 and action_space.is_bounded()):
+        raise ValueError(
+            f"Expected a 1-D Box action with finite bounds, got {action_space}; actions are continuous here and "
+            "scaled by their bounds, so give the task such an action space."
+        )
+    if not np.all(action_space.low < action_space.high):
+        raise ValueError(
+            f"Actions are scaled by their bounds, but low and high are equal in {action_space}; leave out the action "
+            "entries that cannot vary."
+        )
+    return observation_space, action_space
+
+
+def delayed_space(
+    state_space: spaces.Box, action_space: spaces.Box, max_delay: int, state_history: bool = False
+) -> spaces.Dict:
+    """Build the observation space of a delayed task, float32 throughout.
+
+    :param state_space: (obs_dim,), of the task
+    :param action_space: (act_dim,), of the task
+    :param max_delay: D, length of the action history
+    :param state_history: whether it holds the states that were handed out
+    """
+    with np.errstate(over="ignore"):  # a float64 bound beyond float32 becomes infinite
+        low, high = (bound.astype(np.float32) for bound in (state_space.low, state_space.high))
+    parts: dict[str, spaces.Space[Any]] = {
+        "observation": spaces.Box(low, high, dtype=np.float32),
+        "action_history": spaces.Box(-1.0, 1.0, (max_delay, *action_space.shape), np.float32),
+        "delay": spaces.Box(0.0, float(max_delay), (1,), np.float32),
+    }
+    if state_history:  # with zeros where a state is unknown
+        low, high = (np.tile(bound, (max_delay, 1)) for bound in (np.minimum(low, 0), np.maximum(high, 0)))
+        parts["state_history"] = spaces.Box(low, high, dtype=np.float32)
+        parts["state_known"] = spaces.Box(0.0, 1.0, (max_delay,), np.float32)
+    return spaces.Dict(parts)
+
+
 def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> tuple[spaces.Box, int]:
     """Return the space of true states and the largest delay D of a task.
 
     :param observation_space: a 1-D Box, or that of ``DelayedObservationWrapper``
-    :param action_space: a bounded 1-D Box
+    :param action_space: a 1-D Box with finite bounds
     :raises ValueError: for anything else
     """
-    if not (isinstance(action_space, spaces.Box) and len(action_space.shape) == 1 and action_space.is_bounded()):
-        raise ValueError(f"Expected a bounded 1-D Box action space, got {action_space}; use gymnasium's RescaleAction.")
     state_space, max_delay = observation_space, 0
     if isinstance(observation_space, spaces.Dict):
-        keys = {"observation", "action_history", "delay"}
-        if has_state_history(observation_space):
-            keys |= {"state_history", "state_known"}
+        keys = {*KEYS, *STATE_KEYS} if has_state_history(observation_space) else set(KEYS)
         if set(observation_space.keys()) != keys:
             raise ValueError(
-                "Expected the dict observation of DelayedObservationWrapper (observation, action_history, delay), "
+                f"Expected the dict observation of DelayedObservationWrapper ({', '.join(KEYS)}), "
                 f"got the keys {sorted(observation_space.keys())}; wrap the task in it."
             )
         state_space = observation_space["observation"]
         max_delay = observation_space["action_history"].shape[0]  # type: ignore[index]
-    if not (isinstance(state_space, spaces.Box) and len(state_space.shape) == 1):
-        raise ValueError(f"Expected a 1-D Box observation, got {state_space}; use gymnasium's FlattenObservation.")
-    return state_space, max_delay
+    return check_task(state_space, action_space)[0], max_delay
 
 
 def has_state_history(observation_space: spaces.Space[Any]) -> bool:

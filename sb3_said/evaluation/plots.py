@@ -17,16 +17,13 @@ from sb3_said.evaluation.statistics import Interval, Summary, bootstrap_interval
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # Okabe and Ito's palette: told apart by colour-blind readers too.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-N_DELAYS_PLOTTED = 5  # of the delays whose errors a planner logged, where there are more of them than colours
-
-# One more than colours, so that many agents differ in one or the other.
-MARKERS = "osD^vPX"
-
-# Column of progress.csv that counts the planner's updates.
-UPDATES = "planner/n_updates"
+N_DELAYS_PLOTTED = 5  # where a planner logged the errors of more delays than there are colours
+MARKERS = "osD^vPX"  # one more than colours, so that many agents differ in one or the other
+UPDATES = "planner/n_updates"  # column of progress.csv
 
 
 def panels(n: int = 1, width: float = 5.0, height: float = 3.6) -> list[Axes]:
@@ -54,11 +51,8 @@ def panels(n: int = 1, width: float = 5.0, height: float = 3.6) -> list[Axes]:
 
 def save(ax: Axes, path: str | Path) -> None:
     """Write the figure of ``ax``; the file's suffix names the format (.png, .pdf, .svg)."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure = ax.get_figure(root=True)
-    assert figure is not None  # for mypy: axes of `panels` have one
-    figure.savefig(path)
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    _figure(ax).savefig(path)
 
 
 def plot_learning_curve(run: str | Path, ax: Axes | None = None, window: int = 20) -> Axes:
@@ -83,11 +77,9 @@ def plot_learning_curve(run: str | Path, ax: Axes | None = None, window: int = 2
     if evaluations.is_file():
         with np.load(evaluations) as file:
             eval_steps, results = file["timesteps"], file["results"]
-        intervals = [bootstrap_interval(row) for row in results]
-        ax.plot(eval_steps, [i.value for i in intervals], color=COLORS[1], marker="o", markersize=3, label="evaluation")
-        ax.fill_between(
-            eval_steps, [i.low for i in intervals], [i.high for i in intervals], color=COLORS[1], alpha=0.2, linewidth=0
-        )
+        value, low, high = _bounds([bootstrap_interval(row) for row in results])
+        ax.plot(eval_steps, value, color=COLORS[1], marker="o", markersize=3, label="evaluation")
+        ax.fill_between(eval_steps, low, high, color=COLORS[1], alpha=0.2, linewidth=0)
     ax.set_xlabel("environment steps")
     ax.set_ylabel("return of an episode (undiscounted)")
     ax.legend(frameon=False)
@@ -103,18 +95,13 @@ def plot_returns(summaries: Sequence[Summary], ax: Axes | None = None) -> Axes:
     ax = panels(width=1.6 + 1.4 * len(summaries))[0] if ax is None else ax
     for column, summary in enumerate(summaries):
         color = COLORS[column % len(COLORS)]
-        mean = summary.mean_return
         n = len(summary.returns)
         # Spread evenly, not at random, so that the same evaluation draws the same picture.
-        ax.plot(
-            column + np.linspace(-0.25, 0.25, n) if n > 1 else [column],
-            summary.returns, "o", color=color, alpha=0.3, markersize=4, markeredgewidth=0,
-        )  # fmt: skip
-        ax.errorbar(
-            column, mean.value, yerr=[[mean.value - mean.low], [mean.high - mean.value]],
-            fmt="D", color=color, capsize=5, markersize=6,
-        )  # fmt: skip
-        ax.annotate(f"{mean.value:,.0f}", (column, mean.value), (9, 5), textcoords="offset points", color=color)
+        x = column + np.linspace(-0.25, 0.25, n) if n > 1 else [column]
+        ax.plot(x, summary.returns, "o", color=color, alpha=0.3, markersize=4, markeredgewidth=0)
+        value, low, high = _bounds([summary.mean_return])
+        ax.errorbar(column, value, yerr=[value - low, high - value], fmt="D", color=color, capsize=5, markersize=6)
+        ax.annotate(f"{value[0]:,.0f}", (column, value[0]), (9, 5), textcoords="offset points", color=color)
     ax.set_xticks(range(len(summaries)), [f"{s.label}\n{len(s.returns)} episodes" for s in summaries])
     ax.set_xlim(-0.6, len(summaries) - 0.4)
     ax.set_ylabel("return of an episode (undiscounted)")
@@ -141,10 +128,8 @@ def plot_over_delays(table: Mapping[str, Mapping[int | str, Summary]]) -> list[A
         ax.sharey(axes[0])
     axes[0].autoscale_view()  # sharing alone leaves the limits of the first
     axes[0].set_ylabel("return of an episode (undiscounted)")
-    figure = axes[0].get_figure(root=True)
-    assert figure is not None  # for mypy: axes of `panels` have one
     handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=len(kinds), frameon=False)
+    _figure(axes[0]).legend(handles, labels, loc="outside upper center", ncols=len(kinds), frameon=False)
     return axes
 
 
@@ -202,10 +187,8 @@ def _plot_fixed_delays(table: Mapping[str, Mapping[int | str, Summary]], ax: Axe
         played = [delay for delay in delays if delay in row]
         means = [row[delay].mean_return for delay in played]
         _plot_intervals(ax, i, agent, played, means, linestyle="-")
-        ax.fill_between(
-            played, [m.low for m in means], [m.high for m in means],
-            color=COLORS[i % len(COLORS)], alpha=0.15, linewidth=0,
-        )  # fmt: skip
+        _, low, high = _bounds(means)
+        ax.fill_between(played, low, high, color=COLORS[i % len(COLORS)], alpha=0.15, linewidth=0)
     ax.set_xticks(delays)
     ax.set_xlabel("delay (control steps)")
 
@@ -214,9 +197,8 @@ def _plot_random_delays(table: Mapping[str, Mapping[int | str, Summary]], ax: Ax
     names = list(dict.fromkeys(delay for row in table.values() for delay in row if isinstance(delay, str)))
     for i, (agent, row) in enumerate(table.items()):
         offset = 0.7 * ((i + 0.5) / len(table) - 0.5)
-        columns = [column for column, name in enumerate(names) if name in row]
-        means = [row[names[column]].mean_return for column in columns]
-        _plot_intervals(ax, i, agent, [column + offset for column in columns], means, linestyle="none")
+        played = [(column + offset, row[name].mean_return) for column, name in enumerate(names) if name in row]
+        _plot_intervals(ax, i, agent, [x for x, _ in played], [mean for _, mean in played], linestyle="none")
     ax.set_xticks(range(len(names)), [_in_lines(name) for name in names], fontsize="small")
     ax.set_xlim(-0.5, len(names) - 0.5)
     ax.set_xlabel("random delay")
@@ -226,11 +208,22 @@ def _plot_intervals(
     ax: Axes, i: int, agent: str, x: Sequence[float], means: Sequence[Interval], linestyle: str
 ) -> None:
     """Draw the means of the i-th agent with their intervals."""
+    value, low, high = _bounds(means)
     ax.errorbar(
-        x, [m.value for m in means], yerr=[[m.value - m.low for m in means], [m.high - m.value for m in means]],
-        color=COLORS[i % len(COLORS)], marker=MARKERS[i % len(MARKERS)], markersize=5, elinewidth=1, capsize=2,
-        linestyle=linestyle, label=agent,
+        x, value, yerr=[value - low, high - value], color=COLORS[i % len(COLORS)], marker=MARKERS[i % len(MARKERS)],
+        markersize=5, elinewidth=1, capsize=2, linestyle=linestyle, label=agent,
     )  # fmt: skip
+
+
+def _bounds(intervals: Sequence[Interval]) -> np.ndarray:
+    """Return values, lower and upper bounds: (3, n)."""
+    return np.array([(i.value, i.low, i.high) for i in intervals]).reshape(-1, 3).T
+
+
+def _figure(ax: Axes) -> Figure:
+    figure = ax.get_figure(root=True)
+    assert figure is not None  # for mypy: axes of `panels` have one
+    return figure
 
 
 def _in_lines(name: str) -> str:
@@ -240,9 +233,9 @@ def _in_lines(name: str) -> str:
 
 
 def _running_total(counts: Sequence[float]) -> list[float]:
-    """Join counts of updates, which start anew with each training of the planner, into one count.
+    """Join counts of updates into one; each training of the planner counts from 0.
 
-    A resumed training steps back as well, but not to where its first row was: it goes on from its checkpoint.
+    A resumed training steps back as well, to its checkpoint, which lies after its first row.
     """
     first = next((count for count in counts if count > 0), 0.0)
     before, last, joined = 0.0, 0.0, []
@@ -257,7 +250,7 @@ def _running_total(counts: Sequence[float]) -> list[float]:
 def _read_monitors(files: Sequence[Path]) -> tuple[np.ndarray, np.ndarray]:
     """Return environment steps and returns of all episodes in the order in which they ended, (n,) each.
 
-    The order is not that of the files' times, which begin anew with each resume.
+    The files' times do not give that order: they begin anew with each resume.
 
     :param files: one for each environment; they take their steps side by side
     """

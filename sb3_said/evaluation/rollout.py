@@ -13,11 +13,12 @@ import numpy as np
 from sb3_said.evaluation.statistics import Latency
 
 Observation = Any  # one array, or a dict of arrays; batched with a leading axis where a docstring says (B, ...)
+EnvMaker = str | Callable[[], gym.Env[Any, Any]]
 State = tuple[np.ndarray, ...] | None
 
 
 class Model(Protocol):
-    """What is asked of a model: the ``predict`` of Stable-Baselines3."""
+    """Anything with the ``predict`` of Stable-Baselines3."""
 
     def predict(
         self,
@@ -60,7 +61,7 @@ class _Slot:
 
 def rollout(
     model: Model,
-    env: str | Callable[[], gym.Env[Any, Any]],
+    env: EnvMaker,
     n_episodes: int,
     seed: int,
     n_envs: int = 1,
@@ -72,15 +73,15 @@ def rollout(
     """Play whole episodes; episode i starts from ``reset(seed=seed + i)``.
 
     The environments step in lock-step, so that one call of ``predict`` decides for all of them. The next episode goes
-    to the first environment that is free; one without a further episode leaves the batch. Hence exactly
-    ``n_episodes`` episodes are played and counted, short ones are not over-represented, and returns do not depend on
-    ``n_envs`` as long as ``predict`` answers each row by itself (batched arithmetic may still differ in the last bits).
+    to the first environment that is free; an environment without a further episode leaves the batch. Hence exactly
+    ``n_episodes`` episodes count, and short ones are not over-represented. Returns do not depend on ``n_envs`` as long
+    as ``predict`` answers each row by itself (batched arithmetic may still differ in the last bits).
 
     :param model: anything with the ``predict`` of Stable-Baselines3
     :param env: an environment id, or a function that makes an environment
     :param n_episodes: >= 1
     :param seed: reset seed of episode 0; take seeds that training and tuning never saw
-    :param n_envs: environments in lock-step, >= 1; the largest batch that ``predict`` is asked for
+    :param n_envs: environments in lock-step, >= 1; the largest batch that ``predict`` gets
     :param deterministic: handed to ``predict``
     :param normalize: applied to batched observations before ``predict``, such as ``VecNormalize.normalize_obs``
     :param on_step: called with the environment after every step, for instance to render it
@@ -89,11 +90,10 @@ def rollout(
     """
     if n_episodes < 1 or n_envs < 1:
         raise ValueError(f"n_episodes and n_envs must be at least 1, got n_episodes={n_episodes}, n_envs={n_envs}.")
-    make_env = (lambda: gym.make(env)) if isinstance(env, str) else env
     returns, lengths = np.zeros(n_episodes), np.zeros(n_episodes, np.int64)
     call_seconds: list[float] = []
     batch_sizes: list[int] = []
-    envs = [make_env() for _ in range(min(n_envs, n_episodes))]
+    envs = [_make(env) for _ in range(min(n_envs, n_episodes))]
     try:
         slots = [_Slot(e) for e in envs]
         for episode, slot in enumerate(slots):
@@ -135,7 +135,7 @@ def rollout(
     return Rollout(returns, lengths, np.array(call_seconds), np.array(batch_sizes, np.int64))
 
 
-def collect_observations(env: str | Callable[[], gym.Env[Any, Any]], n_observations: int, seed: int) -> Observation:
+def collect_observations(env: EnvMaker, n_observations: int, seed: int) -> Observation:
     """Gather observations along random actions, to time decisions on.
 
     :param env: an environment id, or a function that makes an environment
@@ -143,7 +143,7 @@ def collect_observations(env: str | Callable[[], gym.Env[Any, Any]], n_observati
     :param seed: of the resets and the actions
     :return: (n_observations, ...), a dict of such arrays for a dict space
     """
-    made = gym.make(env) if isinstance(env, str) else env()
+    made = _make(env)
     made.action_space.seed(seed)
     observation, _ = made.reset(seed=seed)
     observations = [observation]
@@ -165,11 +165,11 @@ def measure_latency(
 ) -> Latency:
     """Time single decisions, from a NumPy observation to a NumPy action, as a control loop asks for them.
 
-    A model with a ``warmup`` is warmed up by it, another one by one call that is not counted. Every call after that
-    counts, slow ones included. The state that ``predict`` returns is handed to the next call.
+    ``model.warmup()`` runs first, or one call of ``predict`` where a model has no ``warmup``. Every call after that
+    counts, slow ones included, and gets the state that the call before it returned.
 
     :param model: anything with the ``predict`` of Stable-Baselines3
-    :param observations: (M, ...), or a dict of such arrays; call i is asked about observation i mod M
+    :param observations: (M, ...), or a dict of such arrays; call i gets observation i mod M
     :param n_calls: >= 1
     :param deterministic: handed to ``predict``
     :param normalize: applied to observations (1, ...) inside the measured time
@@ -196,6 +196,10 @@ def measure_latency(
     return Latency.from_seconds(seconds[1:])
 
 
+def _make(env: EnvMaker) -> gym.Env[Any, Any]:
+    return gym.make(env) if isinstance(env, str) else env()
+
+
 def _row(observations: Observation, row: int) -> Observation:
     """Cut one observation (1, ...) out of a batch."""
     if isinstance(observations, dict):
@@ -210,7 +214,7 @@ def _stack(observations: list[Observation]) -> Observation:
 
 
 def _keep_rows(model: Model, state: State, rows: list[int]) -> State:
-    """Keep the rows of the environments that go on; sb3_contrib's recurrent states have the layer axis first."""
+    """Keep the rows of the environments that go on; in sb3_contrib's recurrent states they are on axis 1."""
     if state is None:
         return None
     axis = 1 if hasattr(getattr(model, "policy", None), "lstm_actor") else 0

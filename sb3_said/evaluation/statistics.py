@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from statistics import NormalDist
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.stats import DegenerateDataWarning, bootstrap
 
 
 @dataclass(frozen=True)
 class Interval:
     """A statistic of a sample and its bootstrap interval.
 
-    ``low`` and ``high`` are NaN for a single value: one episode says nothing about the spread.
+    ``low`` and ``high`` are NaN for a single value, which tells nothing about the spread.
     """
 
     value: float
@@ -58,7 +59,7 @@ class Latency:
 
 @dataclass(frozen=True)
 class Summary:
-    """What one row of an evaluation says: who answered, how well, how fast."""
+    """One row of an evaluation: who answered, how well and how fast."""
 
     label: str
     mean_return: Interval
@@ -88,7 +89,7 @@ class Summary:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what ``json.dump`` takes; NaN becomes None, since JSON has no NaN."""
+        """Return the row in JSON types; NaN becomes None, since JSON has no NaN."""
         return {key: _without_nan(value) for key, value in asdict(self).items()}
 
 
@@ -110,10 +111,11 @@ def bootstrap_interval(
     n_resamples: int = 10_000,
     seed: int = 0,
 ) -> Interval:
-    """Bias-corrected and accelerated (BCa) bootstrap interval of a statistic.
+    """Bias-corrected and accelerated (BCa) bootstrap interval of a statistic, by SciPy.
 
-    Returns of control tasks are skewed, a few falls far below many good episodes, which BCa corrects for and the plain
-    percentile interval does not. ``scipy.stats.bootstrap`` gives the same; this spares users the dependency.
+    Returns of control tasks are skewed: a few episodes fall far below many good ones. BCa corrects for that, and the
+    plain percentile interval does not. It is undefined where leaving out any one value changes nothing, as in the
+    median of 1, 1, 1, 1, 5; the percentile interval stands in there.
 
     :param values: (n,), independent: one per episode of one agent, or one per training seed
     :param statistic: of (..., n) along ``axis=-1``, such as ``np.mean`` or ``iqm``
@@ -131,23 +133,13 @@ def bootstrap_interval(
     value = float(statistic(sample, axis=-1))
     if n == 1:
         return Interval(value, math.nan, math.nan, confidence, n)
-    if np.all(sample == sample[0]):
-        return Interval(value, value, value, confidence, n)
-
-    rng = np.random.default_rng(seed)
-    resampled = np.sort(statistic(sample[rng.integers(0, n, (n_resamples, n))], axis=-1))
-    leave_one_out = sample[np.nonzero(~np.eye(n, dtype=bool))[1]].reshape(n, n - 1)
-    deviations = statistic(leave_one_out, axis=-1)
-    deviations = deviations.mean() - deviations
-
-    # Efron (1987): the bias correction z0, the acceleration a, and the percentiles they move the bounds to.
-    normal = NormalDist()
-    below = np.mean(resampled < value) + 0.5 * np.mean(resampled == value)
-    z0 = normal.inv_cdf(float(np.clip(below, 1 / (n_resamples + 1), n_resamples / (n_resamples + 1))))
-    spread = np.sum(deviations**2)
-    a = float(np.sum(deviations**3) / (6 * spread**1.5)) if spread > 0 else 0.0
-    z = [z0 + normal.inv_cdf(p) for p in ((1 - confidence) / 2, (1 + confidence) / 2)]
-    low, high = np.quantile(resampled, [normal.cdf(z0 + zi / (1 - a * zi)) for zi in z])
+    settings = {"statistic": statistic, "confidence_level": confidence, "vectorized": True}
+    with warnings.catch_warnings(), np.errstate(divide="ignore", invalid="ignore"):
+        warnings.simplefilter("ignore", DegenerateDataWarning)
+        found = bootstrap((sample,), n_resamples=n_resamples, rng=np.random.default_rng(seed), **settings)
+    if not np.all(np.isfinite(found.confidence_interval)):
+        found = bootstrap((sample,), n_resamples=0, method="percentile", bootstrap_result=found, **settings)
+    low, high = found.confidence_interval
     return Interval(value, float(low), float(high), confidence, n)
 
 

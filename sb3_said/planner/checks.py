@@ -1,14 +1,51 @@
-"""Checks of arguments."""
+"""Checks of what a user gives: each refuses with what was given and what was expected."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch as th
+
 
 def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
-    """Refuse a name that is not among the choices.
-
-    :raises ValueError: saying what was given and what was expected
-    """
+    """:raises ValueError: for a name that is not among the choices"""
     if value not in choices:
         raise ValueError(f"{name} is {value!r}, expected one of {tuple(choices)}.")
+
+
+def check_shape(name: str, values: th.Tensor, shape: tuple[int | None, ...]) -> None:
+    """:raises ValueError: for another shape, where ``None`` stands for any size, or no rows"""
+    fits = len(values.shape) == len(shape) and all(
+        want in (None, have) for have, want in zip(values.shape, shape, strict=True)
+    )
+    if not fits:
+        expected = ", ".join("any" if want is None else str(want) for want in shape)
+        raise ValueError(f"{name} has the shape {tuple(values.shape)}, expected ({expected}).")
+    if len(values) == 0:
+        raise ValueError(f"{name} is empty, expected at least one row.")
+
+
+def check_finite(name: str, values: th.Tensor, shape: tuple[int | None, ...]) -> None:
+    """:raises ValueError: as :func:`check_shape`, and for numbers that are not finite"""
+    check_shape(name, values, shape)
+    if not values.isfinite().all():
+        raise ValueError(f"{name} has entries that are NaN or infinite; find out where they come from first.")
+
+
+def checked_delay(delay: th.Tensor, batch_size: int, max_delay: int) -> th.Tensor:
+    """Return delays as (B,) int64.
+
+    :raises ValueError: for another shape, fractions, or delays outside 0..max_delay
+    """
+    delay = th.as_tensor(delay)
+    if delay.shape != (batch_size,) or delay.is_floating_point():
+        raise ValueError(
+            f"delay is {delay.dtype} of the shape {tuple(delay.shape)}, expected integers of the shape "
+            f"({batch_size},), one per decision or window."
+        )
+    if not 0 <= int(delay.min()) <= int(delay.max()) <= max_delay:
+        raise ValueError(
+            f"delay runs from {int(delay.min())} to {int(delay.max())}, expected 0..{max_delay}: build the planner "
+            "with a larger max_delay."
+        )
+    return delay.to(th.int64)

@@ -1,4 +1,4 @@
-"""Variance-preserving diffusion in continuous time: schedules, predictions, solvers. Knows no network.
+"""Variance-preserving diffusion in continuous time: schedules, predictions, DDIM. Knows no network.
 
 A noisy sample at time t is ``x = alpha(t) * clean + sigma(t) * noise`` with ``alpha^2 + sigma^2 = 1``.
 """
@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from typing import NamedTuple
 
-import numpy as np
 import torch as th
 
 from sb3_said.planner.checks import check_choice
@@ -21,10 +20,8 @@ END_TIMES = {
     "linear": 1.0,
 }
 SCHEDULES = tuple(END_TIMES)
-PREDICTIONS = ("v", "epsilon", "x0")
+PREDICTIONS = ("v", "epsilon")
 TIME_SAMPLINGS = ("uniform", "logit_normal")
-SOLVERS = ("ddim", "dpmsolver++2m")
-TIME_GRIDS = ("uniform", "log_snr")
 
 
 def alpha_sigma(t: th.Tensor, schedule: str) -> tuple[th.Tensor, th.Tensor]:
@@ -48,14 +45,12 @@ def add_noise(clean: th.Tensor, noise: th.Tensor, alpha: th.Tensor, sigma: th.Te
 def prediction_target(
     clean: th.Tensor, noise: th.Tensor, alpha: th.Tensor, sigma: th.Tensor, prediction: str
 ) -> th.Tensor:
-    """Return what the network is trained to predict: the noise, the clean sample, or v = alpha noise - sigma clean.
+    """Return what the network is trained to predict: the noise, or v = alpha noise - sigma clean.
 
-    :param prediction: ``"v"`` (Salimans and Ho 2022), ``"epsilon"`` (the paper's) or ``"x0"``
+    :param prediction: ``"v"`` (Salimans and Ho 2022) or ``"epsilon"`` (the paper's)
     """
     check_choice("prediction", prediction, PREDICTIONS)
-    if prediction == "epsilon":
-        return noise
-    return clean if prediction == "x0" else alpha * noise - sigma * clean
+    return noise if prediction == "epsilon" else alpha * noise - sigma * clean
 
 
 def to_clean(
@@ -63,19 +58,7 @@ def to_clean(
 ) -> th.Tensor:
     """Return the clean sample that a prediction at a noisy sample x implies; arguments broadcast."""
     check_choice("prediction", prediction, PREDICTIONS)
-    if prediction == "epsilon":
-        return (x - sigma * output) / alpha
-    return output if prediction == "x0" else alpha * x - sigma * output
-
-
-def to_noise(
-    output: th.Tensor, x: th.Tensor, alpha: float | th.Tensor, sigma: float | th.Tensor, prediction: str
-) -> th.Tensor:
-    """Return the noise that a prediction at a noisy sample x implies; arguments broadcast."""
-    check_choice("prediction", prediction, PREDICTIONS)
-    if prediction == "x0":
-        return (x - alpha * output) / sigma
-    return output if prediction == "epsilon" else sigma * x + alpha * output
+    return (x - sigma * output) / alpha if prediction == "epsilon" else alpha * x - sigma * output
 
 
 def draw_times(
@@ -104,57 +87,34 @@ def draw_times(
 
 
 class SolverStep(NamedTuple):
-    """One denoising step: ``x_next = keep * x + clean * x0 + previous * x0_of_the_step_before``."""
+    """One denoising step: ``x_next = keep * x + clean * x0``."""
 
     t: float
     alpha: float
     sigma: float
     keep: float
     clean: float
-    previous: float
-
-
-def solver_times(n_steps: int, schedule: str, time_grid: str = "uniform") -> list[float]:
-    """Return the n_steps + 1 times a solver visits, from the noisiest to START_TIME.
-
-    :param time_grid: ``"uniform"`` in time (the paper's) or ``"log_snr"``, uniform in log(alpha / sigma)
-    """
-    check_choice("schedule", schedule, SCHEDULES)
-    check_choice("time_grid", time_grid, TIME_GRIDS)
-    if n_steps < 1:
-        raise ValueError(f"The number of solver steps is {n_steps}, expected at least 1.")
-    if time_grid == "uniform":
-        return np.linspace(END_TIMES[schedule], START_TIME, n_steps + 1).tolist()
-    t = np.geomspace(END_TIMES[schedule], START_TIME, 20_000)  # fine enough to invert log(alpha / sigma) by a table
-    alpha, sigma = alpha_sigma(th.from_numpy(t), schedule)
-    log_snr = (alpha / sigma).log().numpy()  # increasing
-    return np.interp(np.linspace(log_snr[0], log_snr[-1], n_steps + 1), log_snr, t).tolist()
 
 
 @cache
-def solver_steps(solver: str, schedule: str, n_steps: int, time_grid: str = "uniform") -> tuple[SolverStep, ...]:
-    """Return the coefficients of every step as Python floats.
+def solver_steps(schedule: str, n_steps: int) -> tuple[SolverStep, ...]:
+    """Return the coefficients of DDIM's steps (Song et al. 2021, eta 0), from the noisiest time to START_TIME.
 
-    :param solver: ``"ddim"`` (Song et al. 2021, eta 0) or ``"dpmsolver++2m"`` (Lu et al. 2022, multistep, the first and
-        the last step of first order)
+    The times are uniform, as the paper's.
+
     :param schedule: see :func:`alpha_sigma`
     :param n_steps: number of network evaluations
-    :param time_grid: see :func:`solver_times`
-    :raises ValueError: for an unknown name or n_steps < 1
+    :raises ValueError: for an unknown schedule or n_steps < 1
     """
-    check_choice("solver", solver, SOLVERS)
-    times = solver_times(n_steps, schedule, time_grid)
-    alphas, sigmas = (values.tolist() for values in alpha_sigma(th.tensor(times, dtype=th.float64), schedule))
-    log_snr = [math.log(alpha / sigma) for alpha, sigma in zip(alphas, sigmas, strict=True)]
+    check_choice("schedule", schedule, SCHEDULES)
+    if n_steps < 1:
+        raise ValueError(f"The number of solver steps is {n_steps}, expected at least 1.")
+    times = th.linspace(END_TIMES[schedule], START_TIME, n_steps + 1, dtype=th.float64)
+    alphas, sigmas = (values.tolist() for values in alpha_sigma(times, schedule))
     steps = []
-    for i in range(n_steps):
+    for i, t in enumerate(times[:-1].tolist()):
         keep = sigmas[i + 1] / sigmas[i]
-        clean, previous = alphas[i + 1] - alphas[i] * keep, 0.0  # both solvers' first-order step
-        if solver == "dpmsolver++2m" and 0 < i < n_steps - 1:
-            ratio = (log_snr[i] - log_snr[i - 1]) / (log_snr[i + 1] - log_snr[i])
-            previous = -clean / (2 * ratio)
-            clean -= previous  # extrapolates the clean sample linearly in log SNR
-        steps.append(SolverStep(times[i], alphas[i], sigmas[i], keep, clean, previous))
+        steps.append(SolverStep(t, alphas[i], sigmas[i], keep, alphas[i + 1] - alphas[i] * keep))
     return tuple(steps)
 
 
@@ -165,7 +125,7 @@ def solve(
     prediction: str,
     impose: Callable[[th.Tensor], th.Tensor] = lambda x: x,
 ) -> th.Tensor:
-    """Run a solver from initial noise to a sample.
+    """Run DDIM from initial noise to a sample.
 
     :param predict: gives the network's output at (x, index of the step)
     :param x: initial noise, any shape, float32
@@ -173,11 +133,8 @@ def solve(
     :param prediction: what ``predict`` predicts, see :func:`prediction_target`
     :param impose: applied to the initial noise and after every step, the last included
     """
-    x, before = impose(x), None
+    x = impose(x)
     for i, step in enumerate(steps):
         x0 = to_clean(predict(x, i), x, step.alpha, step.sigma, prediction)
-        x_next = step.keep * x + step.clean * x0
-        if before is not None and step.previous != 0.0:
-            x_next = x_next + step.previous * before
-        x, before = impose(x_next), x0
+        x = impose(step.keep * x + step.clean * x0)
     return x

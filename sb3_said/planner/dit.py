@@ -8,7 +8,6 @@ import torch as th
 import torch.nn.functional as F
 from torch import nn
 
-POSITIONS = ("sinusoidal", "learned")
 HEAD_DIM = 32  # d_model // 32 heads, as in DV and the paper
 N_TIME_FEATURES = 32  # as CleanDiffuser's Fourier embedding
 
@@ -90,13 +89,13 @@ class DiT1d(nn.Module):
     :param length: steps of the longest window
     :param d_model: width, a multiple of 32
     :param depth: number of blocks
-    :param positions: ``"sinusoidal"`` (fixed) or ``"learned"``
     :param embed_known: add an embedding of the whole known part to every token, beside showing it in its place
     :param extra_states: states at indices 1..D may be known too, and are embedded
-    :raises ValueError: for a width that is no multiple of 32 or an unknown kind of positions
+    :raises ValueError: for a width that is no multiple of 32
     """
 
     frequencies: th.Tensor
+    positions: th.Tensor
     is_factor: th.Tensor
 
     def __init__(
@@ -107,15 +106,12 @@ class DiT1d(nn.Module):
         length: int,
         d_model: int = 256,
         depth: int = 2,
-        positions: str = "sinusoidal",
         embed_known: bool = True,
         extra_states: bool = False,
     ) -> None:
         super().__init__()
         if d_model < HEAD_DIM or d_model % HEAD_DIM:
             raise ValueError(f"d_model is {d_model}, but heads are {HEAD_DIM} wide: give a multiple of {HEAD_DIM}.")
-        if positions not in POSITIONS:
-            raise ValueError(f"positions is {positions!r}, expected one of {POSITIONS}.")
         self.d_model = d_model
         self.obs_dim = obs_dim
         self.max_delay = max_delay
@@ -132,7 +128,8 @@ class DiT1d(nn.Module):
         is_factor = th.tensor([0.0, 1.0, 0.0] * (2 * depth) + [0.0, 1.0])[:, None]  # (6 * depth + 2, 1)
         self.register_buffer("is_factor", is_factor, persistent=False)
         # Periods of 4 to 1/16 of the diffusion time: smooth enough for few steps, fine enough near t = 0
-        self.register_buffer("frequencies", 2 * math.pi * 2 ** th.linspace(-2.0, 4.0, N_TIME_FEATURES // 2))
+        frequencies = 2 * math.pi * 2 ** th.linspace(-2.0, 4.0, N_TIME_FEATURES // 2)
+        self.register_buffer("frequencies", frequencies, persistent=False)
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 nn.init.xavier_uniform_(module.weight)
@@ -141,11 +138,7 @@ class DiT1d(nn.Module):
         # adaLN-zero: every block is the identity and the output is 0 before training
         for layer in (self.modulation, self.out):
             nn.init.zeros_(layer.weight)
-        self.positions: th.Tensor
-        if positions == "learned":
-            self.positions = nn.Parameter(0.02 * th.randn(length, d_model))
-        else:
-            self.register_buffer("positions", sinusoidal_positions(length, d_model))
+        self.register_buffer("positions", sinusoidal_positions(length, d_model), persistent=False)
 
     def modulations(self, t: th.Tensor) -> th.Tensor:
         """Return what the time changes in every layer: (n, 6 * depth + 2, d_model) float32.

@@ -10,6 +10,8 @@ from __future__ import annotations
 import torch as th
 import torch.nn.functional as F
 
+from sb3_said.planner.checks import check_choice
+
 MASKS = ("random", "fixed")
 
 
@@ -83,8 +85,7 @@ def draw_delays(
         0 starts every episode and D is the longest and hardest
     :raises ValueError: for an unknown mask
     """
-    if mask not in MASKS:
-        raise ValueError(f"mask is {mask!r}, expected one of {MASKS}.")
+    check_choice("mask", mask, MASKS)
     if mask == "fixed":
         return th.full((batch_size,), max_delay, device=device)
     source = "cpu" if generator is None else generator.device

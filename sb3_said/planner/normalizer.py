@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch as th
 from torch import nn
 
-from sb3_said.planner.diffusion import check_choice
+from sb3_said.planner.checks import check_choice
 from sb3_said.replay.windows import Windows
 
 ACTION_TRANSFORMS = ("standard", "tanh")

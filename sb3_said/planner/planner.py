@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Hashable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch as th
 from torch import nn
 
 from sb3_said.planner import diffusion, inpainting
+from sb3_said.planner.checks import check_finite, check_shape, checked_delay
 from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.dit import DiT1d
+from sb3_said.planner.graphs import RecordedFunction
 from sb3_said.planner.normalizer import Normalizer
-from sb3_said.planner.precision import autocast, compute_dtype
-from sb3_said.planner.sampling import Prepared, SamplingCache, addresses, is_frozen
+from sb3_said.planner.precision import autocast
+from sb3_said.planner.selection import ValueFn, choose, mean_value, value_of
 from sb3_said.replay.windows import Windows
 
-ValueFn = Callable[[th.Tensor, th.Tensor], th.Tensor]
+MAX_GRAPHS = 8  # of a GPU; each keeps the memory of one decision
 
 
 class Plan(NamedTuple):
@@ -63,23 +64,37 @@ class InpaintingPlanner(nn.Module):
             self.window_length,
             config.d_model,
             config.depth,
-            config.positions,
             config.embed_known,
             config.extra_state_probability > 0,
         )
         self.normalizer = Normalizer(
             obs_dim, act_dim, self.window_length, config.action_transform, config.relative_states
         )
-        self._cache = SamplingCache()
+        self._graphs: dict[Hashable, RecordedFunction] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_graphs": {}}  # a copy records its own
 
     @property
     def device(self) -> th.device:
         """Where the planner lives."""
         return self.normalizer.state_mean.device
 
-    def autocast(self) -> AbstractContextManager[object]:
-        """Return the context of ``config.precision`` here; :meth:`loss` enters it itself."""
-        return autocast(self.config.precision, self.device)
+    def check_ages(self, ages: Sequence[int]) -> None:
+        """Refuse ages amid an episode that the network was not trained to plan at.
+
+        :param ages: in control steps
+        :raises ValueError: for ages above ``max_delay``; with ``mask="fixed"``, for any other than ``max_delay``
+        """
+        if self.config.mask == "fixed" and any(age != self.max_delay for age in ages):
+            raise ValueError(
+                f"A planner with mask='fixed' plans at age {self.max_delay} only, got {', '.join(map(str, ages))}; "
+                "train one with mask='random', which plans at every age up to the largest."
+            )
+        if max(ages, default=0) > self.max_delay:
+            raise ValueError(
+                f"This planner plans at ages 0..{self.max_delay}, got {max(ages)}; build one with a larger max_delay."
+            )
 
     def fit_normalizer(self, states: th.Tensor, actions: th.Tensor, windows: Windows | None = None) -> None:
         """Set the mean and standard deviation that states and (transformed) actions are z-scored with.
@@ -91,8 +106,8 @@ class InpaintingPlanner(nn.Module):
         :raises ValueError: for a wrong shape, no rows, or numbers that are not finite
         """
         states, actions = self._tensor(states), self._tensor(actions)
-        _check("states", states, (None, self.obs_dim))
-        _check("actions", actions, (len(states), self.act_dim))
+        check_finite("states", states, (None, self.obs_dim))
+        check_finite("actions", actions, (len(states), self.act_dim))
         self.normalizer.fit(states, actions)
         if windows is not None:
             self.normalizer.fit_moves(Windows(*(part.to(self.device) for part in windows)))
@@ -119,15 +134,15 @@ class InpaintingPlanner(nn.Module):
         """
         config, device = self.config, self.device
         states, actions = self._tensor(windows.states), self._tensor(windows.actions)
-        _check_shape("windows.states", states, (None, self.window_length, self.obs_dim))
+        check_shape("windows.states", states, (None, self.window_length, self.obs_dim))
         n = len(states)
-        _check_shape("windows.actions", actions, (n, self.window_length, self.act_dim))
+        check_shape("windows.actions", actions, (n, self.window_length, self.act_dim))
         if weight is not None:
-            _check_shape("weight", weight := self._tensor(weight), (n,))
+            check_shape("weight", weight := self._tensor(weight), (n,))
         if delay is None:
             delay = inpainting.draw_delays(n, self.max_delay, config.mask, config.mask_end_probability, generator)
         # Delays on a GPU are not read back: every update would wait for it, and a recorded one could not
-        delay = self._delay(delay, n) if delay.device.type == "cpu" else delay
+        delay = checked_delay(delay, n, self.max_delay).to(self.device) if delay.device.type == "cpu" else delay
         valid = windows.valid.to(device) & self._within(delay, self.window_length)  # (B, L)
         clean = self.normalizer.normalize(states, actions)  # (B, L, obs_dim + act_dim)
         # Steps behind an episode's end repeat its last row: they are neither shown as known nor learned, and no more
@@ -145,8 +160,8 @@ class InpaintingPlanner(nn.Module):
         )
         alpha, sigma = (factor[:, None, None] for factor in diffusion.alpha_sigma(t, config.schedule))
         x = th.where(known, clean, diffusion.add_noise(clean, noise, alpha, sigma))
-        with self.autocast():
-            network = self.network
+        network = self.network
+        with autocast(config.precision, device):
             output = network(x, network.context(clean, known), network.modulations(t), valid)
         target = diffusion.prediction_target(clean, noise, alpha, sigma, config.prediction)
         learned = valid[..., None] & ~known
@@ -179,11 +194,12 @@ class InpaintingPlanner(nn.Module):
         The arguments that default to ``None`` take the config's value. One candidate is enough, and drawn, where the
         others could not matter: at temperature 0, where all are alike, and by default without a ``value_fn``.
 
-        Freeze a trained planner with ``requires_grad_(False)``: only then is what depends on the weights alone kept
-        from one call to the next. On a GPU its whole decision is one CUDA graph, made at the first call with these
-        sizes and settings, if the ``value_fn`` is a module or a method of one, which must then never wait for the
-        device. Any other ``value_fn`` may read what a graph would not see change: its plans are made operation by
-        operation.
+        On a GPU a decision becomes one recorded graph after a few calls with these sizes and settings, if the
+        ``value_fn`` is a module or a method of one, which must then never wait for the device. Any other ``value_fn``
+        may read what a graph would not see change: its plans are made operation by operation.
+
+        A planner with ``mask="fixed"`` has known ``max_delay`` actions in every window. At an episode's start, s_0
+        stands for s_{t-D} and zeros for the actions before it (paper, Appendix B).
 
         :param observation: (B, obs_dim) delayed observations s_{t-d}
         :param action_history: (B, D, act_dim), the D newest actions, oldest first
@@ -205,10 +221,10 @@ class InpaintingPlanner(nn.Module):
         """
         config = self.config
         observation, action_history = self._tensor(observation), self._tensor(action_history)
-        _check("observation", observation, (None, self.obs_dim))
+        check_finite("observation", observation, (None, self.obs_dim))
         n = len(observation)
-        _check("action_history", action_history, (n, self.max_delay, self.act_dim))
-        delay = self._delay(delay, n)
+        check_finite("action_history", action_history, (n, self.max_delay, self.act_dim))
+        delay = self._trained_delay(checked_delay(delay, n, self.max_delay).to(self.device), action_history)
         extra_states = self._extra_states(state_history, state_known, n)
         shortest, longest = int(delay.min()), int(delay.max())
         length = longest + config.horizon  # a decision costs what its age costs
@@ -216,7 +232,7 @@ class InpaintingPlanner(nn.Module):
         shape = (length, self.obs_dim + self.act_dim)
         if noise is not None:
             noise = self._tensor(noise)
-            _check("noise", noise, (n_candidates, self.window_length, shape[1]))
+            check_finite("noise", noise, (n_candidates, self.window_length, shape[1]))
             n_candidates, noise = len(noise), noise[:, :length]
         elif n_candidates is None:
             n_candidates = 1 if value_fn is None else config.n_candidates
@@ -224,43 +240,47 @@ class InpaintingPlanner(nn.Module):
             raise ValueError(
                 f"n_candidates is {n_candidates} and temperature {temperature}, expected at least 1 and at least 0."
             )
-        steps = diffusion.solver_steps(
-            config.solver,
-            config.schedule,
-            config.sampling_steps if sampling_steps is None else sampling_steps,
-            config.time_grid,
-        )
+        n_steps = config.sampling_steps if sampling_steps is None else sampling_steps
+        steps = diffusion.solver_steps(config.schedule, n_steps)
 
         if temperature == 0:
             x = th.zeros(n, 1, *shape, device=self.device)
         else:
             noise = self._noise((n, n_candidates, *shape), generator) if noise is None else noise
             x = temperature * noise.expand(n, -1, -1, -1)  # (B, N, L, obs_dim + act_dim)
-        n_tokens = x.shape[0] * x.shape[1] * self.window_length  # of the largest age, so that all have one format
-        dtype = compute_dtype(config.precision, self.device, n_tokens * config.d_model)
-        prepared = self._cache.prepare(self, self.network, steps, dtype)
-        inputs = (observation, action_history, delay, x, *extra_states)
-        if self._can_be_graphed(value_fn):
-            key = (config, tuple(x.shape), value_fn, addresses(self if value_fn is None else _owner(value_fn)))
-            graph = self._cache.graph(key, partial(self._inpaint, prepared, steps, value_fn, 0, True), inputs)
-            plan = Plan(*graph(*inputs))
+        times = th.tensor([step.t for step in steps], device=self.device)
+        inputs = (times, observation, action_history, delay, x, *extra_states)
+        if self._can_be_recorded(value_fn):
+            plan = Plan(*self._graph(steps, value_fn, x.shape)(*inputs))
         else:
-            plan = self._inpaint(prepared, steps, value_fn, shortest, longest > shortest, *inputs)
+            plan = self._inpaint(steps, value_fn, shortest, longest > shortest, *inputs)
         if plan.values.isnan().any():
             raise ValueError("value_fn returned NaN, so that no candidate is the best; check the critic.")
         return plan
 
-    def _can_be_graphed(self, value_fn: ValueFn | None) -> bool:
-        is_module = value_fn is None or isinstance(_owner(value_fn), nn.Module)
-        return self.device.type == "cuda" and is_module and is_frozen(self)
+    def _can_be_recorded(self, value_fn: ValueFn | None) -> bool:
+        return self.device.type == "cuda" and (value_fn is None or isinstance(_owner(value_fn), nn.Module))
+
+    def _graph(
+        self, steps: Sequence[diffusion.SolverStep], value_fn: ValueFn | None, shape: th.Size
+    ) -> RecordedFunction:
+        """Return the graph of decisions with these settings and sizes, and with the weights where they now lie."""
+        modules: list[Any] = [self] if value_fn is None else [self, _owner(value_fn)]
+        tensors = [tensor for module in modules for tensor in (*module.parameters(), *module.buffers())]
+        key = (self.config, steps, value_fn, shape, tuple(tensor.data_ptr() for tensor in tensors))
+        if key not in self._graphs:
+            if len(self._graphs) == MAX_GRAPHS:
+                del self._graphs[next(iter(self._graphs))]  # the oldest
+            self._graphs[key] = RecordedFunction(partial(self._inpaint, steps, value_fn, 0, True), self.device)
+        return self._graphs[key]
 
     def _inpaint(
         self,
-        prepared: Prepared,
         steps: Sequence[diffusion.SolverStep],
         value_fn: ValueFn | None,
         shortest: int,
         is_mixed: bool,
+        times: th.Tensor,
         observation: th.Tensor,
         action_history: th.Tensor,
         delay: th.Tensor,
@@ -272,6 +292,7 @@ class InpaintingPlanner(nn.Module):
 
         :param shortest: a lower bound of the delays: no state before it is scored
         :param is_mixed: whether delays may differ, so that some windows end before others
+        :param times: (n_steps,) of the steps
         :param x: (B, N, L, obs_dim + act_dim) initial noise, scaled
         :param state_history: (B, D, obs_dim), and which of it is known: ``state_known``, (B, D) bool
         """
@@ -280,56 +301,36 @@ class InpaintingPlanner(nn.Module):
         known = inpainting.known_mask(delay, length, self.obs_dim, self.act_dim, state_known)
         clean = self.normalizer.normalize(*self._split(given))  # (B, L, obs_dim + act_dim), as given and known
         valid = self._within(delay, length).repeat_interleave(x.shape[1], 0) if is_mixed else None  # (B * N, L)
-        network, modulations = prepared
+        network = self.network
+        modulations = network.modulations(times)  # (n_steps, 6 * depth + 2, d_model)
         context = network.context(clean, known)
-        x = diffusion.solve(
-            lambda x, i: network(x.flatten(0, 1), context, modulations[i], valid).float().view_as(x),
-            x,
-            steps,
-            self.config.prediction,
-            impose=lambda x: th.where(known[:, None], clean[:, None], x),
-        )
+        # Of the largest age, so that decisions at all ages have one number format
+        size = x.shape[0] * x.shape[1] * self.window_length * self.config.d_model
+        with autocast(self.config.precision, x.device, size):
+            x = diffusion.solve(
+                lambda x, i: network(x.flatten(0, 1), context, modulations[i], valid).float().view_as(x),
+                x,
+                steps,
+                self.config.prediction,
+                impose=lambda x: th.where(known[:, None], clean[:, None], x),
+            )
         # What is given comes back exactly as given, without the rounding of the normaliser
         x = th.where(known[:, None], given[:, None], th.cat(self.normalizer.denormalize(x), dim=-1))
         states, actions = self._split(x)
         rows = th.arange(len(x), device=x.device)
         present = states[rows, :, delay].mean(1)  # (B, obs_dim)
-        values = self._values(states, actions, present, delay, value_fn, shortest)  # (B, N)
-        return Plan(
-            choose(actions[rows, :, delay], values, self.config.choice_factor), present, states, actions, values
-        )
-
-    def _values(
-        self,
-        states: th.Tensor,
-        actions: th.Tensor,
-        present: th.Tensor,
-        delay: th.Tensor,
-        value_fn: ValueFn | None,
-        shortest: int,
-    ) -> th.Tensor:
-        """Return the mean value of each candidate's scored states: (B, N)."""
+        decisions = actions[rows, :, delay]  # (B, N, act_dim)
         if value_fn is None:
-            return th.zeros(states.shape[:2], device=self.device)
-        if self.config.scored_states == "decision":
-            rows = th.arange(len(delay), device=self.device)
-            states = present[:, None, None].expand(-1, states.shape[1], -1, -1)  # (B, N, 1, obs_dim)
-            actions = actions[rows, :, delay][:, :, None]  # windows of one step
-            skipped, first = 0, th.zeros_like(delay)
-        elif self.config.scored_states == "all":
-            skipped, first = 1, th.ones_like(delay)
+            values = th.zeros(x.shape[:2], device=x.device)
+        elif self.config.scored_states == "decision":
+            shared = present[:, None].expand(-1, x.shape[1], -1)  # (B, N, obs_dim)
+            values = value_of(value_fn, shared[:, :, None], decisions[:, :, None])[..., 0]
         else:
-            skipped, first = 1 + shortest, 1 + delay  # (B,)
-        values = value_fn(states[:, :, skipped:], actions[:, :, skipped:]).float()  # (B, N, L - skipped)
-        if values.shape != (*states.shape[:2], states.shape[2] - skipped):
-            raise ValueError(
-                f"value_fn returned the shape {tuple(values.shape)}, expected one value per state, "
-                f"{(*states.shape[:2], states.shape[2] - skipped)}: drop a last dimension of 1."
-            )
-        steps = th.arange(skipped, states.shape[2], device=self.device)
-        last = first + 1 if self.config.scored_states == "decision" else delay + self.config.horizon  # (B,)
-        scored = ((steps >= first[:, None]) & (steps < last[:, None]))[:, None]  # (B, 1, L - skipped)
-        return th.where(scored, values, 0.0).sum(-1) / scored.sum(-1)
+            first = th.ones_like(delay) if self.config.scored_states == "all" else delay + 1  # (B,)
+            skipped = 1 if self.config.scored_states == "all" else shortest + 1
+            end = delay + self.config.horizon
+            values = mean_value(value_fn, states, actions, first, end, skipped)
+        return Plan(choose(decisions, values, self.config.choice_factor), present, states, actions, values)
 
     def _within(self, delay: th.Tensor, length: int) -> th.Tensor:
         """Tell which steps a window of each delay has, d + horizon of them: (B, L) bool."""
@@ -346,20 +347,17 @@ class InpaintingPlanner(nn.Module):
     def _tensor(self, values: th.Tensor) -> th.Tensor:
         return th.as_tensor(values, dtype=th.float32, device=self.device)
 
-    def _delay(self, delay: th.Tensor, batch_size: int) -> th.Tensor:
-        """Return checked delays: (B,) int64 on this planner's device."""
-        delay = th.as_tensor(delay)
-        if delay.shape != (batch_size,) or delay.is_floating_point():
-            raise ValueError(
-                f"delay is {delay.dtype} of the shape {tuple(delay.shape)}, expected integers of the shape "
-                f"({batch_size},), one per decision or window."
-            )
-        if not 0 <= int(delay.min()) <= int(delay.max()) <= self.max_delay:
-            raise ValueError(
-                f"delay runs from {int(delay.min())} to {int(delay.max())}, expected 0..{self.max_delay}: build the "
-                "planner with a larger max_delay."
-            )
-        return delay.to(self.device, th.int64)
+    def _trained_delay(self, delay: th.Tensor, action_history: th.Tensor) -> th.Tensor:
+        """Return the delays to plan with: (B,) int64; with ``mask="fixed"`` D, at the start of an episode too.
+
+        :raises ValueError: for a younger observation amid an episode, which that mask was not trained for
+        """
+        if self.config.mask == "random":
+            return delay
+        older = th.arange(self.max_delay, device=delay.device) < self.max_delay - delay[:, None]  # (B, D)
+        amid = (action_history.ne(0).any(-1) & older).any(1)  # (B,): acted on longer ago than the observation is old
+        self.check_ages(delay[amid].tolist())
+        return th.full_like(delay, self.max_delay)
 
     def _extra_states(
         self, state_history: th.Tensor | None, state_known: th.Tensor | None, batch_size: int
@@ -378,47 +376,13 @@ class InpaintingPlanner(nn.Module):
         if state_history is None or state_known is None:  # zeros, so that a recorded graph always has these inputs
             state_history, state_known = th.zeros(*shape, self.obs_dim), th.zeros(shape)
         state_history, state_known = self._tensor(state_history), self._tensor(state_known)
-        _check("state_history", state_history, (*shape, self.obs_dim))
-        _check("state_known", state_known, shape)
+        check_finite("state_history", state_history, (*shape, self.obs_dim))
+        check_finite("state_known", state_known, shape)
         if not ((state_known == 0) | (state_known == 1)).all():
             raise ValueError("state_known has entries other than 0 and 1, expected 1 where a state is known.")
         return state_history, state_known.bool()
 
 
-def choose(actions: th.Tensor, values: th.Tensor, factor: float | None) -> th.Tensor:
-    """Return one action of N: the most valuable, or the mean weighed by exp(factor * z), z the standardised values.
-
-    Where the present is uncertain the most valuable of many is mostly a lucky one, and acting on luck is jittery.
-
-    :param actions: (B, N, act_dim)
-    :param values: (B, N)
-    :param factor: None for the most valuable
-    :return: (B, act_dim)
-    """
-    if factor is None:
-        return actions[th.arange(len(actions), device=actions.device), values.argmax(1)]
-    z = (values - values.mean(1, keepdim=True)) / values.std(1, correction=0, keepdim=True).clamp(min=1e-6)
-    return ((factor * z).softmax(1)[..., None] * actions).sum(1)
-
-
 def _owner(value_fn: ValueFn) -> object:
     """Return the object whose method a function is, or the function."""
     return getattr(value_fn, "__self__", value_fn)
-
-
-def _check_shape(name: str, values: th.Tensor, shape: tuple[int | None, ...]) -> None:
-    """Refuse a tensor of another shape; ``None`` stands for any size."""
-    if len(values.shape) != len(shape) or any(
-        want not in (None, have) for have, want in zip(values.shape, shape, strict=True)
-    ):
-        expected = ", ".join("any" if want is None else str(want) for want in shape)
-        raise ValueError(f"{name} has the shape {tuple(values.shape)}, expected ({expected}).")
-    if len(values) == 0:
-        raise ValueError(f"{name} is empty, expected at least one row.")
-
-
-def _check(name: str, values: th.Tensor, shape: tuple[int | None, ...]) -> None:
-    """Refuse a tensor of another shape or with numbers that are not finite."""
-    _check_shape(name, values, shape)
-    if not values.isfinite().all():
-        raise ValueError(f"{name} has entries that are NaN or infinite; find out where they come from first.")

@@ -19,9 +19,7 @@ def has_bfloat16(device: th.device) -> bool:
     if device.type == "cuda":
         return th.cuda.is_bf16_supported(including_emulation=False)
     if device.type == "cpu":
-        if not hasattr(th.cpu, "get_capabilities"):  # older PyTorch cannot tell
-            return False
-        capabilities = th.cpu.get_capabilities()
+        capabilities = th.cpu.get_capabilities() if hasattr(th.cpu, "get_capabilities") else {}  # not in older PyTorch
         return any(capabilities.get(name, False) for name in ("avx512_bf16", "amx_bf16"))
     return False
 
@@ -39,7 +37,7 @@ def compute_dtype(precision: str, device: th.device, size: float = math.inf) -> 
     return th.bfloat16 if precision == "bfloat16" or (precision == "auto" and pays) else th.float32
 
 
-def autocast(precision: str, device: th.device) -> AbstractContextManager[object]:
-    """Return the context the network is trained in: autocast to :func:`compute_dtype`, or nothing for float32."""
-    dtype = compute_dtype(precision, device)
+def autocast(precision: str, device: th.device, size: float = math.inf) -> AbstractContextManager[object]:
+    """Return the context that a network runs in: autocast to :func:`compute_dtype`, or nothing for float32."""
+    dtype = compute_dtype(precision, device, size)
     return nullcontext() if dtype == th.float32 else th.autocast(device.type, dtype=dtype)

@@ -10,10 +10,11 @@ from typing import Any
 
 import torch as th
 
-from sb3_said.planner.capture import CapturedStep
-from sb3_said.planner.config import PlannerConfig, weight_settings
+from sb3_said.planner.config import PlannerConfig
+from sb3_said.planner.graphs import RecordedFunction
 from sb3_said.planner.inpainting import draw_delays
 from sb3_said.planner.planner import InpaintingPlanner
+from sb3_said.planner.values import scaled_values, window_weight
 from sb3_said.planner.yardstick import Present, RegressionYardstick
 from sb3_said.replay.windows import Windows, WindowSource
 
@@ -41,25 +42,6 @@ def ema_decay(step: int, config: PlannerConfig) -> float:
     if not config.ema_warmup:
         return config.ema_decay
     return min(config.ema_decay, (1 + step) / (10 + step))
-
-
-def value_weight(values: th.Tensor, weight_factor: float) -> th.Tensor:
-    """Return exp(beta (V - 1)), the weight of a window whose first state has normalised value V in [0, 1].
-
-    :param values: (B,) V
-    :param weight_factor: beta; 0 weighs all windows alike
-    """
-    return th.exp(weight_factor * (values - 1.0))
-
-
-def value_rank(values: th.Tensor) -> th.Tensor:
-    """Return the part of the others that each value is above, equal ones counted half: (M,) in [0, 1].
-
-    :param values: (M,)
-    """
-    ordered = values.sort().values
-    below, up_to = th.searchsorted(ordered, values), th.searchsorted(ordered, values, right=True)  # (M,)
-    return (below + up_to - 1) / (2 * max(1, len(values) - 1))
 
 
 def worse_than_regression(errors: dict[str, float], tolerance: float = 0.05) -> str:
@@ -124,7 +106,7 @@ class PlannerTrainer:
         on_gpu = self.device.type == "cuda"
         self.generator = th.Generator(self.device if on_gpu else "cpu").manual_seed(seed)
         self._settings = {
-            "config": planner.config.to_dict(),
+            **planner.config.weight_settings(),
             "gradient_steps": gradient_steps,
             "held_out": held_out,
             "seed": seed,
@@ -132,9 +114,8 @@ class PlannerTrainer:
         }
 
         training_source, held_source = source.split(held_out, seed) if held_out > 0 else (source, None)
-        if self.config.value_scale == "rank":
-            training_source = replace(training_source, values=value_rank(training_source.values))
-        self.source = training_source.to(self.device)
+        values = scaled_values(training_source.values, self.config.value_scale)
+        self.source = replace(training_source, values=values).to(self.device)
         windows = self.source.sample(N_NORMALIZER_WINDOWS, planner.window_length, self.generator)
         planner.fit_normalizer(self.source.start_states(), self.source.start_actions(), windows)
         self.online = copy.deepcopy(planner).train().requires_grad_(True)
@@ -158,7 +139,7 @@ class PlannerTrainer:
         self._loss_sums = th.zeros(2, device=self.device)
         self._n_losses = 0
         self._bad_update = th.full((), -1, device=self.device)
-        self._captured = CapturedStep(self._descend, self.generator) if on_gpu else None
+        self._recorded = RecordedFunction(self._descend, self.device, self.generator) if on_gpu else None
         self._held_out = {} if held_source is None else self._draw_held_out(held_source, seed)
 
     def step(self) -> None:
@@ -169,7 +150,7 @@ class PlannerTrainer:
         rate = learning_rate(self.n_updates, self.gradient_steps, self.config)
         self._set_rate(self.optimizer, rate)
         self._set_rate(self.yardstick_optimizer, rate * YARDSTICK_LEARNING_RATE / self.config.learning_rate)
-        losses = self._captured() if self._captured is not None else self._descend()  # (2,)
+        (losses,) = self._descend() if self._recorded is None else self._recorded()  # (2,)
         with th.no_grad():  # not recorded, as a replay would not tell the planner's sampling cache of new weights
             th._foreach_lerp_(self._averaged, self._online, 1.0 - ema_decay(self.n_updates, self.config))
             self._loss_sums += losses
@@ -180,10 +161,10 @@ class PlannerTrainer:
         if self.n_updates % 100 == 0:
             self._check_finite()
 
-    def _descend(self) -> th.Tensor:
+    def _descend(self) -> tuple[th.Tensor]:
         """Draw a batch and move the online weights and the yardstick's, reading no number off the device.
 
-        :return: (2,) float32, the planner's loss and the yardstick's
+        :return: one tensor (2,) float32, the planner's loss and the yardstick's
         """
         config = self.config
         self.optimizer.zero_grad()
@@ -197,7 +178,7 @@ class PlannerTrainer:
             self.generator,
             self.device,
         )  # (B,)
-        weight = value_weight(windows.values, config.weight_factor)  # (B,)
+        weight = window_weight(windows.values, config.weight_factor)  # (B,)
         loss = self.online.loss(windows, delay, weight, self.generator)
         loss.backward()
         if config.gradient_clip is not None:
@@ -207,7 +188,7 @@ class PlannerTrainer:
         yardstick_loss = self.yardstick.loss(*self._yardstick_batch(windows, delay), weight)
         yardstick_loss.backward()
         self.yardstick_optimizer.step()
-        return th.stack((loss, yardstick_loss)).detach()
+        return (th.stack((loss, yardstick_loss)).detach(),)
 
     def train(
         self, n_steps: int | None = None, callback: Callable[[PlannerTrainer], bool | None] | None = None
@@ -280,7 +261,7 @@ class PlannerTrainer:
 
         :raises ValueError: when that training had other settings, so that the end would be neither's
         """
-        saved, given = weight_settings(state["settings"]), weight_settings(self._settings)
+        saved, given = state["settings"], self._settings
         if saved != given:
             differing = [key for key in sorted(saved | given) if saved.get(key) != given.get(key)]
             raise ValueError(
@@ -299,8 +280,8 @@ class PlannerTrainer:
         self._loss_sums.copy_(state["loss_sums"])
         self._n_losses = state["n_losses"]
         self._bad_update.fill_(-1)
-        if self._captured is not None:
-            self._captured.forget()  # it writes to the optimizer state that was replaced
+        if self._recorded is not None:
+            self._recorded.forget()  # it writes to the optimizer state that was replaced
 
     def _rate(self, rate: float) -> float | th.Tensor:
         """Return a learning rate as the optimizers take it: on a GPU a tensor, so that a recorded update reads it."""

@@ -1,61 +1,80 @@
-"""Discounted values of stored steps, for trajectory weights."""
+"""What a training window weighs: the return to go of its first state, on a scale from 0 to 1, in an exponential."""
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Callable
+
+import torch as th
+
+from sb3_said.planner.checks import check_choice
+from sb3_said.replay.windows import WindowSource
+
+VALUE_SCALES = ("rank", "range")
 
 
-def discounted_values(
-    rewards: np.ndarray, terminated: np.ndarray, ends: np.ndarray, tail_values: np.ndarray, gamma: float
-) -> np.ndarray:
-    """Return the discounted return-to-go of every step, bootstrapped where an episode was cut off.
+def returns_to_go(
+    source: WindowSource,
+    gamma: float,
+    terminal_penalty: float | None = None,
+    value_fn: Callable[[th.Tensor, th.Tensor], th.Tensor] | None = None,
+) -> th.Tensor:
+    """Return the discounted return to go of every start, bootstrapped where its episode was cut off.
 
-    At a termination the return is the reward alone. At any other end of an episode (time limit, interruption, newest
-    step) it is ``tail_values``: without this, states near a time limit look worthless although nothing is wrong with
-    them.
+    Without the bootstrap, states near a time limit would look worthless although nothing is wrong with them.
 
-    :param rewards: (T, n_envs), in the order of time
-    :param terminated: (T, n_envs) bool, true episode ends
-    :param ends: (T, n_envs) bool, the last stored step of each episode, terminated or not; true in the last row
-    :param tail_values: (T, n_envs), value of taking the stored action where an episode was cut off; read only there
+    :param source: M starts
     :param gamma: discount factor
-    :return: (T, n_envs) float32
+    :param terminal_penalty: replaces the reward of a terminating step (paper, Table 5); None keeps it
+    :param value_fn: (states (K, obs_dim), actions (K, act_dim)) -> (K,), the value of the last stored step of an
+        episode that was cut off. Without it an episode is taken to go on at its average reward
+    :return: (M,) float32
+    :raises ValueError: for gamma = 1 without ``value_fn``, where going on for ever is worth no finite value
     """
-    values = np.empty_like(rewards, dtype=np.float32)
-    following = np.zeros(rewards.shape[1], dtype=np.float64)
-    for t in range(len(rewards) - 1, -1, -1):
-        last = np.where(terminated[t], rewards[t], tail_values[t])
-        following = np.where(ends[t], last, rewards[t] + gamma * following)
-        values[t] = following
-    return values
-
-
-def average_reward_tail(rewards: np.ndarray, ends: np.ndarray, gamma: float) -> np.ndarray:
-    """Bootstrap where no critic is at hand: as if each episode went on at its own average reward.
-
-    :param rewards: (T, n_envs)
-    :param ends: (T, n_envs) bool, the last stored step of each episode; true in the last row
-    :param gamma: discount factor
-    :return: (T, n_envs), read only where ``ends``
-    :raises ValueError: for gamma = 1, where going on for ever is worth no finite value
-    """
-    if gamma >= 1.0:
+    rewards = source.rewards[source.rows, source.envs].clone()  # (M,)
+    terminated, last = source.terminated[source.rows, source.envs], source.remaining == 1
+    cut = last & ~terminated
+    if terminal_penalty is not None:
+        rewards[terminated] = terminal_penalty
+    if value_fn is not None:
+        rewards[cut] = value_fn(source.start_states()[cut], source.start_actions()[cut]).float()
+    elif gamma < 1.0:
+        _, episode = source.episodes.unique(return_inverse=True)
+        means = th.zeros(int(episode.max()) + 1).index_add(0, episode, rewards) / episode.bincount()
+        rewards[cut] = means[episode[cut]] / (1.0 - gamma)
+    else:
         raise ValueError(f"An episode that goes on has a finite value only with gamma < 1, got gamma={gamma}.")
-    tails = np.zeros_like(rewards, dtype=np.float32)
-    for env in range(rewards.shape[1]):
-        last = np.flatnonzero(ends[:, env])
-        first = np.concatenate([[0], last[:-1] + 1])
-        sums = np.add.reduceat(rewards[:, env], first) if len(last) else np.zeros(0)
-        tails[last, env] = sums / (last - first + 1) / (1.0 - gamma)
-    return tails
+
+    order = (source.episodes * (int(source.remaining.max()) + 1) + source.remaining).argsort()  # newest step first
+    value, values = 0.0, []
+    for reward, is_last in zip(rewards[order].tolist(), last[order].tolist(), strict=True):
+        value = reward if is_last else reward + gamma * value
+        values.append(value)
+    returns = th.empty(len(source))
+    returns[order] = th.tensor(values)
+    return returns
 
 
-def normalise_values(values: np.ndarray) -> np.ndarray:
-    """Map values to [0, 1] by their minimum and maximum, as w = exp(beta (V - 1)) expects.
+def scaled_values(values: th.Tensor, scale: str) -> th.Tensor:
+    """Map values to [0, 1], as the weight expects.
 
-    :param values: any shape; constant values become ones, so that every weight is one
+    :param values: (M,)
+    :param scale: ``"range"``, the place between the lowest and the highest (paper), ones where all are equal; or
+        ``"rank"``, the part of the others that a value is above, equal ones counted half
+    :raises ValueError: for another scale
     """
-    low, high = float(values.min()), float(values.max())
-    if high == low:
-        return np.ones_like(values)
-    return (values - low) / (high - low)
+    check_choice("scale", scale, VALUE_SCALES)
+    if scale == "range":
+        low, high = values.min(), values.max()
+        return th.ones_like(values) if low == high else (values - low) / (high - low)
+    ordered = values.sort().values
+    below, up_to = th.searchsorted(ordered, values), th.searchsorted(ordered, values, right=True)  # (M,)
+    return (below + up_to - 1) / (2 * max(1, len(values) - 1))
+
+
+def window_weight(values: th.Tensor, weight_factor: float) -> th.Tensor:
+    """Return exp(beta (V - 1)), the weight of a window whose first state has the scaled value V in [0, 1].
+
+    :param values: (B,) V
+    :param weight_factor: beta; 0 weighs all windows alike
+    """
+    return th.exp(weight_factor * (values - 1.0))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,14 +12,11 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples, Repla
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_said.delays.space import EXECUTED, UNDELAYED, check_spaces
-from sb3_said.files.registry import register_class
-from sb3_said.planner.values import average_reward_tail, discounted_values, normalise_values
 from sb3_said.replay.windows import Windows, WindowSource
 
-_ROW_ARRAYS = ("observations", "actions", "rewards", "dones", "timeouts", "ages", "steps", "tail_slots")
+_ROW_ARRAYS = ("observations", "actions", "rewards", "dones", "timeouts", "ages", "steps", "ends")
 
 
-@register_class
 class DelayedReplayBuffer(ReplayBuffer):
     """Replay of a delayed task, at the memory of an undelayed one.
 
@@ -85,11 +81,9 @@ class DelayedReplayBuffer(ReplayBuffer):
         self.timeouts = np.zeros(shape, np.float32)
         self.ages = np.zeros(shape, np.int16)
         self.steps = np.zeros(shape, np.int32)
-        # Tails: (state, age) that follow a row which no stored row continues. Slot -1: the next row continues.
-        self.tail_slots = np.full(shape, -1, np.int32)
-        self.tail_states: np.ndarray = np.zeros((0, state_space.shape[0]), np.float32)
-        self.tail_ages: np.ndarray = np.zeros(0, np.int16)
-        self._free_slots: list[int] = []
+        # Rows that no stored row continues, and the (state, age) that follows each: its tail
+        self.ends = np.zeros(shape, bool)
+        self.tails: dict[tuple[int, int], tuple[np.ndarray, int]] = {}
         # What follows the newest row of each environment, and the observation that would continue its episode.
         self._next_states = np.zeros((n_envs, state_space.shape[0]), np.float32)
         self._next_ages = np.zeros(n_envs, np.int16)
@@ -121,10 +115,13 @@ class DelayedReplayBuffer(ReplayBuffer):
         if self.is_delayed:
             self._check_order(obs, next_obs, continues)
         started = np.flatnonzero(~continues)
-        if self.full:
-            self._free(row)
+        for env in np.flatnonzero(self.ends[row]).tolist():  # overwritten
+            del self.tails[row, env]
+        self.ends[row] = False
         if self.size() > 0:
-            self._keep_tails(previous, started)
+            for env in started.tolist():
+                self.tails[previous, env] = self._next_states[env].copy(), int(self._next_ages[env])
+                self.ends[previous, env] = True
 
         self.observations[row] = np.where(continues[:, None], self._next_states, obs["observation"])
         self.steps[row] = np.where(continues, self.steps[previous] + 1, 0)
@@ -203,31 +200,12 @@ class DelayedReplayBuffer(ReplayBuffer):
             )
         return np.stack([info[UNDELAYED] for info in infos])
 
-    def _keep_tails(self, row: int, envs: np.ndarray) -> None:
-        for env in envs:
-            if not self._free_slots:
-                n_slots = len(self.tail_ages)
-                n_new = max(n_slots, 64)
-                new_states = np.zeros((n_new, self.tail_states.shape[1]), np.float32)
-                self.tail_states = np.concatenate([self.tail_states, new_states])
-                self.tail_ages = np.concatenate([self.tail_ages, np.zeros(n_new, np.int16)])
-                self._free_slots = list(range(n_slots + n_new - 1, n_slots - 1, -1))
-            slot = self._free_slots.pop()
-            self.tail_slots[row, env] = slot
-            self.tail_states[slot] = self._next_states[env]
-            self.tail_ages[slot] = self._next_ages[env]
-
     def reset(self) -> None:
         """Forget everything stored."""
         super().reset()
-        self.tail_slots[:] = -1
-        self.tail_states, self.tail_ages, self._free_slots = self.tail_states[:0], self.tail_ages[:0], []
+        self.ends[:] = False
+        self.tails.clear()
         self._expected = None
-
-    def _free(self, row: int) -> None:
-        slots = self.tail_slots[row]
-        self._free_slots.extend(slots[slots >= 0].tolist())
-        slots[:] = -1
 
     # ------------------------------------------------------------------------------------------------ sampling
 
@@ -293,9 +271,8 @@ class DelayedReplayBuffer(ReplayBuffer):
         """Return s_{t+1} and its observation's age: (B, obs_dim), (B,)."""
         next_rows = (rows + 1) % self.buffer_size
         states, ages = self.observations[next_rows, envs], self.ages[next_rows, envs]
-        slots = self.tail_slots[rows, envs]
-        ended = slots >= 0
-        states[ended], ages[ended] = self.tail_states[slots[ended]], self.tail_ages[slots[ended]]
+        for i in np.flatnonzero(self.ends[rows, envs]):
+            states[i], ages[i] = self.tails[int(rows[i]), int(envs[i])]
         newest = rows == (self.pos - 1) % self.buffer_size
         states[newest], ages[newest] = self._next_states[envs[newest]], self._next_ages[envs[newest]]
         return states, ages
@@ -334,25 +311,14 @@ class DelayedReplayBuffer(ReplayBuffer):
 
     # ------------------------------------------------------------------------------------------------ windows
 
-    def window_source(
-        self,
-        newest_fraction: float = 1.0,
-        gamma: float = 0.99,
-        terminal_penalty: float | None = -100.0,
-        value_fn: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
-        env: VecNormalize | None = None,
-    ) -> WindowSource:
-        """Return every place a planner's window can start, over this buffer's own arrays.
+    def window_source(self, newest_fraction: float = 1.0, env: VecNormalize | None = None) -> WindowSource:
+        """Return every place a planner's window can start, over this buffer's own arrays, all of value 0.
 
         The buffer must not grow while the source is in use.
 
         :param newest_fraction: use only the newest part of the buffer (the paper's 20 % is 0.2), in (0, 1]
-        :param gamma: discount of the windows' values
-        :param terminal_penalty: replaces the reward of a terminating step in the values (paper, Table 5); None keeps it
-        :param value_fn: (states (B, obs_dim), actions (B, act_dim)) -> (B,), bootstraps where an episode was cut off;
-            without it an episode is taken to go on at its average reward
         :param env: normalises states, as the expert's observations are
-        :raises ValueError: when the buffer is empty, the fraction is not in (0, 1], or gamma is 1 without ``value_fn``
+        :raises ValueError: when the buffer is empty, or the fraction is not in (0, 1]
         """
         if not 0.0 < newest_fraction <= 1.0:
             raise ValueError(f"newest_fraction is a part of the buffer in (0, 1], got {newest_fraction}.")
@@ -360,22 +326,10 @@ class DelayedReplayBuffer(ReplayBuffer):
             raise ValueError("The replay buffer is empty; collect transitions before training a planner.")
         n_rows = max(int(self.size() * newest_fraction), 1)
         rows = (self.pos - n_rows + np.arange(n_rows)) % self.buffer_size  # (T,), oldest first
-        ends = self.tail_slots[rows] >= 0  # (T, n_envs)
+        ends = self.ends[rows]  # (T, n_envs), a copy
         ends[-1] = True
         last = np.where(ends, np.arange(n_rows)[:, None], n_rows)
         last = np.minimum.accumulate(last[::-1], axis=0)[::-1]  # (T, n_envs): where each episode ends
-
-        terminated = (self.dones[rows] * (1 - self.timeouts[rows])) > 0
-        rewards = self.rewards[rows]
-        if terminal_penalty is not None:
-            rewards = np.where(terminated, terminal_penalty, rewards)
-        if value_fn is None:
-            tails = average_reward_tail(rewards, ends, gamma)
-        else:
-            tails = np.zeros_like(rewards)
-            t, e = np.nonzero(ends & ~terminated)
-            tails[t, e] = value_fn(self.observations[rows[t], e], self.actions[rows[t], e])
-        values = normalise_values(discounted_values(rewards, terminated, ends, tails, gamma))
 
         states = self.observations
         if env is not None and self.is_delayed:
@@ -383,13 +337,16 @@ class DelayedReplayBuffer(ReplayBuffer):
             states = env.normalize_obs({**raw, "observation": states})["observation"]
         elif env is not None:
             states = env.normalize_obs(states)  # type: ignore[assignment]  # an array for an array
-        episodes = last + np.arange(self.n_envs) * n_rows  # unique for each environment and end
         grid = np.broadcast_to(rows[:, None], ends.shape), np.broadcast_to(np.arange(self.n_envs), ends.shape)
-        flat = (*grid, last - np.arange(n_rows)[:, None] + 1, values, episodes)
+        remaining = last - np.arange(n_rows)[:, None] + 1
+        episodes = last + np.arange(self.n_envs) * n_rows  # unique for each environment and end
+        per_start = (*grid, remaining, episodes, np.zeros(ends.shape, np.float32))
         return WindowSource(
             th.from_numpy(np.asarray(states, np.float32)),
             th.from_numpy(self.actions),
-            *(th.from_numpy(x.flatten()) for x in flat),  # a copy: the grid is read-only
+            th.from_numpy(self.rewards),
+            th.from_numpy((self.dones > 0) & (self.timeouts == 0)),
+            *(th.from_numpy(x.flatten()) for x in per_start),  # a copy: the grid is read-only
         )
 
     def sample_windows(self, batch_size: int, length: int, generator: th.Generator | None = None) -> Windows:
@@ -411,12 +368,12 @@ class DelayedReplayBuffer(ReplayBuffer):
         return {
             "pos": self.pos,
             "full": self.full,
-            "free_slots": np.array(self._free_slots, np.int64),
             "expected": self._expected,
             "next_states": self._next_states,
             "next_ages": self._next_ages,
-            "tail_states": self.tail_states,
-            "tail_ages": self.tail_ages,
+            "tail_places": np.array([*self.tails], np.int64).reshape(-1, 2),
+            "tail_states": np.array([state for state, _ in self.tails.values()], np.float32),
+            "tail_ages": np.array([age for _, age in self.tails.values()], np.int16),
             **{name: getattr(self, name)[: self.size()] for name in _ROW_ARRAYS},
         }
 
@@ -434,13 +391,15 @@ class DelayedReplayBuffer(ReplayBuffer):
                 f"{self.observations.shape}; use the buffer_size, n_envs, task and max_delay it was made with."
             )
         self.pos, self.full = state["pos"], state["full"]
-        self._free_slots = state["free_slots"].tolist()
         self._expected = state["expected"]
         self._next_states, self._next_ages = state["next_states"].copy(), state["next_ages"].copy()
-        self.tail_states, self.tail_ages = state["tail_states"].copy(), state["tail_ages"].copy()
+        places = map(tuple, state["tail_places"].tolist())
+        self.tails = dict(
+            zip(places, zip(state["tail_states"].copy(), state["tail_ages"].tolist(), strict=True), strict=True)
+        )
         for name in _ROW_ARRAYS:
             getattr(self, name)[:size] = state[name]
-        self.tail_slots[size:] = -1  # of whatever was stored before
+        self.ends[size:] = False  # of whatever was stored before
 
     def _fits(self, expected: dict[str, np.ndarray] | None) -> bool:
         """Tell whether the observation that would continue a stored replay is of this buffer's task."""

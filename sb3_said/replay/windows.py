@@ -17,7 +17,7 @@ class Windows(NamedTuple):
     states: th.Tensor  # (B, L, obs_dim) float32
     actions: th.Tensor  # (B, L, act_dim) float32, in [-1, 1]
     valid: th.Tensor  # (B, L) bool; a prefix of each row, never empty
-    values: th.Tensor  # (B,) float32 in [0, 1], normalised value of the first state
+    values: th.Tensor  # (B,) float32, what the source says of the first state
 
 
 @dataclass(frozen=True)
@@ -29,20 +29,24 @@ class WindowSource:
 
     :param states: (n_rows, n_envs, obs_dim) float32 true states
     :param actions: (n_rows, n_envs, act_dim) float32 in [-1, 1]
+    :param rewards: (n_rows, n_envs) float32
+    :param terminated: (n_rows, n_envs) bool, where the task itself ended an episode, not a time limit
     :param rows: (n_starts,) int64, the row of each possible start
     :param envs: (n_starts,) int64, the environment of each possible start
     :param remaining: (n_starts,) int64, stored steps from the start to its episode's end, both included, >= 1
-    :param values: (n_starts,) float32, normalised value of each start's state, in [0, 1]
     :param episodes: (n_starts,) int64, a number for the episode each start belongs to
+    :param values: (n_starts,) float32, a value of each start's state, by which a trainer may weigh windows
     """
 
     states: th.Tensor
     actions: th.Tensor
+    rewards: th.Tensor
+    terminated: th.Tensor
     rows: th.Tensor
     envs: th.Tensor
     remaining: th.Tensor
-    values: th.Tensor
     episodes: th.Tensor
+    values: th.Tensor
 
     def __len__(self) -> int:
         return len(self.rows)

@@ -44,11 +44,13 @@ class DelayedSAC(SafeSaveMixin, SAC):
     :param policy: ``"MultiInputPolicy"`` or ``"MlpPolicy"``, which name the same class
     :param env: a task in a ``DelayedObservationWrapper``, or one with a 1-D Box observation (delay 0)
     :param learning_rate: of actor, critics and entropy coefficient; a number or a schedule
+    :param learning_starts: environment steps of random actions before the first update; rl_zoo3's and Wang et al.'s for
+        MuJoCo, where SB3 has 100
     :param augment_state: the actor reads [observation, action history, age]
     :param delay_reconciled_critic: the critics read the true state
-    :param relabelled_ages: part of the transitions of an update that are seen at the age another was observed at, in
-        [0, 1]: where delays vary, each step teaches the actor what to do under the others too. Measured at delays 0..16
-        (results/README.md); 0 is SADR as published, and under one fixed delay there is no difference
+    :param relabelled_ages: part of an update's transitions, in [0, 1], that are shown at the age of another one: where
+        delays vary, each step teaches the actor what to do under the others too. Measured at delays 0..16
+        (results/README.md); 0 is SADR as published. Under one fixed delay nothing changes
     :param sac_kwargs: every other argument of :class:`stable_baselines3.SAC`
     :raises ValueError: for spaces that are neither, a ``VecNormalize`` of more than the observation, or options that
         need another replay buffer (``n_steps`` > 1) or policy
@@ -67,6 +69,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
         env: GymEnv | str,
         learning_rate: float | Schedule = 3e-4,
         *,
+        learning_starts: int = 10_000,
         augment_state: bool = True,
         delay_reconciled_critic: bool = True,
         relabelled_ages: float = 0.5,
@@ -82,7 +85,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
         self.relabelled_ages = relabelled_ages
         if isinstance(policy, str):  # SB3 would refuse one of the two names, by the kind of space
             policy = self.policy_aliases.get(policy, policy)  # type: ignore[assignment]
-        super().__init__(policy, env, learning_rate, **sac_kwargs)
+        super().__init__(policy, env, learning_rate, learning_starts=learning_starts, **sac_kwargs)
 
     def _setup_model(self) -> None:
         self._check_parts()

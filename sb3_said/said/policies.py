@@ -5,7 +5,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, fields
+from dataclasses import fields
 from itertools import product
 from typing import Any, Literal, get_args
 
@@ -17,6 +17,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from sb3_said.delays.space import UNDELAYED, check_spaces, has_state_history
 from sb3_said.files.registry import register_class
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
+from sb3_said.planner.graphs import EAGER_CALLS
 from sb3_said.sac.policies import DelayedSACPolicy
 
 Answer = Literal["planner", "expert"]
@@ -51,24 +52,26 @@ class SAIDPolicy(DelayedSACPolicy):
                 "SAID scores planned states with the expert's critics, which must read true states; "
                 "leave delay_reconciled_critic=True."
             )
-        state_space, max_delay = check_spaces(observation_space, action_space)
-        self.planner_kwargs = planner_kwargs or {}
-        names = [field.name for field in fields(PlannerConfig)]
-        if unknown := sorted(set(self.planner_kwargs) - set(names)):
+        names, given = [field.name for field in fields(PlannerConfig)], planner_kwargs or {}
+        if unknown := sorted(set(given) - set(names)):
             raise ValueError(f"The planner has no setting {', '.join(unknown)}; it has {', '.join(names)}.")
+        self.register_buffer("planner_updates", th.zeros(()))
         with th.random.fork_rng(devices=[]):  # the expert learns as it would without a planner
-            self.planner = InpaintingPlanner(
-                state_space.shape[0], action_space.shape[0], max_delay, PlannerConfig(**self.planner_kwargs)
-            )
+            self.make_planner(PlannerConfig(**given))
         if has_state_history(observation_space) and self.planner.config.extra_state_probability == 0:
             raise ValueError(
                 "Observations have a state_history, but the planner is not trained with extra known states; give "
                 "planner_kwargs={'extra_state_probability': 0.5}, or leave state_history=False in "
                 "DelayedObservationWrapper."
             )
-        self.planner.requires_grad_(False)
-        self.register_buffer("planner_updates", th.zeros(()))
         self._answer: Answer | None = None
+
+    def make_planner(self, config: PlannerConfig) -> None:
+        """Take a new, untrained planner of these settings."""
+        state_space, max_delay = check_spaces(self.observation_space, self.action_space)
+        obs_dim, act_dim = state_space.shape[0], self.action_space.shape[0]  # type: ignore[index]  # a Box has a shape
+        self.planner = InpaintingPlanner(obs_dim, act_dim, max_delay, config).to(self.device).requires_grad_(False)
+        self.planner_updates.zero_()
 
     @property
     def planner_is_trained(self) -> bool:
@@ -130,17 +133,6 @@ class SAIDPolicy(DelayedSACPolicy):
         else:
             states, history = observation, observation.new_zeros(len(observation), 0, self.planner.act_dim)
             delay = th.zeros(len(observation), dtype=th.long, device=observation.device)
-        if self.planner.config.mask == "fixed":
-            # Only D known actions were ever trained. At an episode's start, s_0 then stands for s_{t-D} and zeros for
-            # the actions before it (paper, Appendix B).
-            before = th.arange(self.max_delay, device=delay.device) < self.max_delay - delay[:, None]  # (B, D)
-            amid = (history.ne(0).any(-1) & before).any(1)  # (B,): acted on longer ago than the observation is old
-            if amid.any():
-                raise ValueError(
-                    f"This planner was trained for observations of age {self.max_delay} only (mask='fixed'), but "
-                    f"one amid an episode has age {int(delay[amid][0])}; train with mask='random' for several delays."
-                )
-            delay = th.full_like(delay, self.max_delay)
         chooses = self.planner.config.temperature > 0  # else there is no noise and one candidate
         plan = self.planner.plan(
             states,
@@ -166,9 +158,9 @@ class SAIDPolicy(DelayedSACPolicy):
         return th.randn(shape, generator=th.Generator().manual_seed(seed))
 
     def warmup(self, batch_size: int = 1) -> None:
-        """Answer a few times for nothing, so that the first answer after it takes no longer than any other.
+        """Run a few dummy predictions, so that the next decision takes no longer than any later one.
 
-        Modulations, weights in bfloat16, the CPU's choice of kernels and a GPU's graph are made at a first answer.
+        The first calls choose a CPU's kernels and record a GPU's graph.
 
         :param batch_size: observations of a later ``predict``
         :raises ValueError: for a batch_size below 1
@@ -178,21 +170,21 @@ class SAIDPolicy(DelayedSACPolicy):
         space = self.observation_space
         parts = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
         arrays = {key: np.zeros((batch_size, *(part.shape or ())), np.float32) for key, part in parts.items()}
-        devices = [self.device] if self.device.type == "cuda" else []
-        with th.random.fork_rng(devices=devices):  # who draws actions afterwards draws the same
-            for delay, deterministic in product((0, self.max_delay), (True, False, True)):
+        on_gpu = self.device.type == "cuda"
+        calls = range(EAGER_CALLS + 1 if on_gpu else 1)
+        with th.random.fork_rng(devices=[self.device] if on_gpu else []):  # who draws afterwards draws the same
+            for delay, deterministic, _ in product((0, self.max_delay), (True, False), calls):
                 if "delay" in arrays:
                     arrays["delay"][:] = delay
-                self.predict(
-                    arrays if isinstance(space, spaces.Dict) else arrays["observation"], None, None, deterministic
-                )
+                obs = arrays if isinstance(space, spaces.Dict) else arrays["observation"]
+                self.predict(obs, deterministic=deterministic)
 
     def set_training_mode(self, mode: bool) -> None:
         super().set_training_mode(mode)
         self.planner.train(mode)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "planner_kwargs": asdict(self.planner.config)}
+        return {**super()._get_constructor_parameters(), "planner_kwargs": self.planner.config.to_dict()}
 
 
 def _rows(observation: PyTorchObs) -> Iterator[PyTorchObs]:

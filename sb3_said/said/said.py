@@ -3,26 +3,31 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import asdict, replace
+import zlib
+from dataclasses import replace
+from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import configure_logger
+from tqdm.auto import tqdm
 
-from sb3_said.delays.space import ages_of, has_state_history, written_ages
+from sb3_said.delays.space import ages_of, has_state_history
+from sb3_said.files.archive import load_tree, save_tree
 from sb3_said.planner.config import SAMPLING_SETTINGS
-from sb3_said.planner.trainer import PlannerTrainer
+from sb3_said.planner.trainer import PlannerTrainer, worse_than_regression
+from sb3_said.planner.values import returns_to_go
 from sb3_said.sac import DelayedSAC
 from sb3_said.said.callbacks import PlannerTrainingCallback
 from sb3_said.said.policies import SAIDPolicy
 
 HELD_OUT = 0.05  # of the planner's data, in whole episodes
+PLANNER_CHECKPOINT_NAME = "planner_checkpoint.zip"
 
 SelfSAID = TypeVar("SelfSAID", bound="SAID")
 
@@ -37,10 +42,11 @@ class SAID(DelayedSAC):
     :param policy: ``"MultiInputPolicy"`` or ``"MlpPolicy"``, which name the same class
     :param env: a task in a ``DelayedObservationWrapper``, or one with a 1-D Box observation (delay 0)
     :param learning_rate: of the expert
-    :param planner_kwargs: fields of :class:`~sb3_said.planner.PlannerConfig`
+    :param planner_kwargs: fields of :class:`~sb3_said.planner.PlannerConfig`; the attribute has all of them
     :param planner_gradient_steps: updates of one planner training; the paper makes 1,000,000
     :param planner_train_freq: also train the planner every so many environment steps; the paper only at the end (None)
-    :param planner_newest_fraction: train on the newest part of the buffer only (the paper's 20 % is 0.2)
+    :param planner_newest_fraction: train on the newest part of the buffer only. The paper finds its newest 20 % as good
+        as all; here it is better, where policies change fast
     :param planner_terminal_penalty: replaces the reward of a terminating step in the values that weigh windows (paper,
         Table 5); None keeps it, for tasks that end when they are done
     :param sac_kwargs: every other argument of :class:`~sb3_said.sac.DelayedSAC` and of SB3's ``SAC``
@@ -58,9 +64,9 @@ class SAID(DelayedSAC):
         learning_rate: float | Schedule = 3e-4,
         *,
         planner_kwargs: dict[str, Any] | None = None,
-        planner_gradient_steps: int = 20_000,
+        planner_gradient_steps: int = 25_000,
         planner_train_freq: int | None = None,
-        planner_newest_fraction: float = 1.0,
+        planner_newest_fraction: float = 0.2,
         planner_terminal_penalty: float | None = -100.0,
         **sac_kwargs: Any,
     ):
@@ -71,14 +77,19 @@ class SAID(DelayedSAC):
             raise ValueError(
                 f"planner_newest_fraction is a part of the buffer in (0, 1], got {planner_newest_fraction}."
             )
-        self.planner_kwargs = planner_kwargs
+        self._given_planner_kwargs = planner_kwargs or {}
         self.planner_gradient_steps = planner_gradient_steps
         self.planner_train_freq = planner_train_freq
         self.planner_newest_fraction = planner_newest_fraction
         self.planner_terminal_penalty = planner_terminal_penalty
-        self._planner_settings: dict[str, Any] = {}  # every field of the config, for files: defaults may change
         self._planner_trained_at = 0  # num_timesteps of the last planner training
         super().__init__(policy, env, learning_rate, **sac_kwargs)
+
+    @property
+    def planner_kwargs(self) -> dict[str, Any]:
+        """Every setting of the planner, which keeps them: see :meth:`set_planner`."""
+        policy = getattr(self, "policy", None)
+        return self._given_planner_kwargs if policy is None else policy.planner.config.to_dict()
 
     def _check_parts(self) -> None:
         super()._check_parts()
@@ -90,14 +101,15 @@ class SAID(DelayedSAC):
             )
 
     def _policy_flags(self) -> dict[str, Any]:
-        return {**super()._policy_flags(), "planner_kwargs": {**self._planner_settings, **(self.planner_kwargs or {})}}
+        return {**super()._policy_flags(), "planner_kwargs": self.planner_kwargs}
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        self._planner_settings = asdict(self.policy.planner.config)
-        is_new = self.trained_ages is None  # else it was loaded, and check_ages says what must be said
-        if is_new and self.env is not None and (reason := self._why_no_answer(ages_of(self.env))):
-            warnings.warn(reason, stacklevel=3)
+        if self.trained_ages is None and self.env is not None:  # else it was loaded, and check_ages says it
+            try:
+                self.policy.planner.check_ages(ages_of(self.env))
+            except ValueError as error:  # no error yet: the expert may learn under another delay
+                warnings.warn(str(error), stacklevel=3)
 
     def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:
         """Keep this agent's own planner where the given one was never trained and has other settings."""
@@ -143,7 +155,7 @@ class SAID(DelayedSAC):
 
         ``model.set_planner(temperature=0.3, n_candidates=50)``
 
-        :param settings: ``solver``, ``time_grid``, ``sampling_steps``, ``n_candidates``, ``temperature``,
+        :param settings: ``sampling_steps``, ``n_candidates``, ``temperature``,
             ``scored_states`` or ``choice_factor`` of :class:`~sb3_said.planner.PlannerConfig`
         :raises ValueError: for other settings, which the weights depend on, and for values outside their range
         """
@@ -153,34 +165,23 @@ class SAID(DelayedSAC):
                 "give it as planner_kwargs of a new agent."
             )
         self.policy.planner.config = replace(self.policy.planner.config, **settings)
-        self.planner_kwargs = {**(self.planner_kwargs or {}), **settings}
-        self.policy.planner_kwargs = {**self.policy.planner_kwargs, **settings}
 
     def check_ages(self, ages: list[int]) -> None:
         """Refuse ages at which the planner, once trained, has no answer; warn where the expert knows none.
 
         :param ages: that it will meet amid episodes, in control steps
-        :raises ValueError: for a planner with ``mask="fixed"``, which answers at age ``max_delay`` only, at others
+        :raises ValueError: as :meth:`InpaintingPlanner.check_ages`
         """
-        if self.policy.planner_is_trained and (reason := self._why_no_answer(ages)):
-            raise ValueError(reason)
+        if self.policy.planner_is_trained:
+            self.policy.planner.check_ages(ages)
         super().check_ages(ages)
-
-    def _why_no_answer(self, ages: list[int]) -> str | None:
-        max_delay = self.policy.max_delay
-        if self.policy.planner.config.mask == "random" or ages == [max_delay]:
-            return None
-        return (
-            f"A planner with mask='fixed' answers at age {max_delay} only, but this environment has ages "
-            f"{written_ages(ages)}; train one with mask='random', which serves every delay up to the largest."
-        )
 
     def _serves(self, ages: list[int]) -> bool:
         # Masks were drawn from all of 0..D, over true states that replay has at every age
-        return self.policy.who_answers == "planner" and self._why_no_answer(ages) is None
+        return self.policy.who_answers == "planner"
 
     def warmup(self, batch_size: int = 1) -> None:
-        """Answer a few times for nothing: see :meth:`SAIDPolicy.warmup`. A control loop calls it once before it starts.
+        """Run a few dummy predictions: see :meth:`SAIDPolicy.warmup`. A control loop calls it once before it starts.
 
         :param batch_size: observations of a later ``predict``
         """
@@ -192,43 +193,84 @@ class SAID(DelayedSAC):
         :param gradient_steps: ``planner_gradient_steps`` by default
         :raises ValueError: when the buffer is empty, as it is after ``load``
         """
-        source = self.replay_buffer.window_source(
-            self.planner_newest_fraction,
-            self.gamma,
-            self.planner_terminal_penalty,
-            value_fn=self._stored_values,
-            env=self._vec_normalize_env,
-        )
+        source = self.replay_buffer.window_source(self.planner_newest_fraction, self._vec_normalize_env)
+        values = returns_to_go(source, self.gamma, self.planner_terminal_penalty, self._stored_values)
         return PlannerTrainer(
             self.policy.planner,
-            source,
+            replace(source, values=values),
             self.planner_gradient_steps if gradient_steps is None else gradient_steps,
             held_out=HELD_OUT if len(source.episodes.unique()) > 1 else 0.0,
             seed=self.seed or 0,
         )
 
-    def train_planner(self, gradient_steps: int | None = None, progress_bar: bool = False) -> None:
+    @th.no_grad()
+    def _stored_values(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """Return values as the environment's rewards would sum up, of states as windows have them: (B,)."""
+        values = self.policy.value(states.to(self.device), actions.to(self.device)).cpu()
+        env = self._vec_normalize_env
+        return values if env is None else th.from_numpy(env.unnormalize_reward(values.numpy()))
+
+    def train_planner(
+        self,
+        gradient_steps: int | None = None,
+        folder: str | Path | None = None,
+        progress_bar: bool = False,
+        log_interval: int = 500,
+        eval_interval: int = 2_000,
+        save_interval: int = 1_000,
+    ) -> None:
         """Train the planner on the replay buffer as it is, without running the expert.
 
+        Interrupting (Ctrl-C) ends the training early and keeps the planner as far as it got.
+
         :param gradient_steps: ``planner_gradient_steps`` by default
+        :param folder: keep a checkpoint there, and continue from it if it is of the same training
         :param progress_bar: show one
-        :raises ValueError: when the buffer is empty
+        :param log_interval: updates between two rows of losses in the log
+        :param eval_interval: updates between two measurements of the held-out errors, beside the regression's
+        :param save_interval: updates between two checkpoints
+        :raises ValueError: when the buffer is empty, or the checkpoint is of a training with other settings
         """
-        callback = PlannerTrainingCallback(progress_bar=progress_bar)
         if not hasattr(self, "_logger"):  # not set_logger: learn() makes its own
             self._logger = configure_logger(self.verbose, self.tensorboard_log, "SAID", reset_num_timesteps=False)
-        callback.init_callback(self)
-        callback.train_planner(gradient_steps)
+        trainer = self.make_planner_trainer(gradient_steps)
+        total = trainer.gradient_steps
+        checkpoint = None if folder is None else Path(folder) / PLANNER_CHECKPOINT_NAME
+        replay = self.replay_buffer.actions[: self.replay_buffer.size()]
+        data = {"num_timesteps": self.num_timesteps, "replay": zlib.crc32(replay.data)}
+        if checkpoint is not None and checkpoint.exists():
+            state = load_tree(checkpoint)
+            if {key: state[key] for key in data} == data:
+                trainer.load_state_dict(state["trainer"])
 
-    def _stored_values(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """Return values as the environment's rewards would sum up, of states as the environment gives them: (B,)."""
-        env = self._vec_normalize_env
-        if env is not None:
-            is_dict = isinstance(self.observation_space, spaces.Dict)
-            states = env.normalize_obs({"observation": states})["observation"] if is_dict else env.normalize_obs(states)  # type: ignore[assignment]
-        with th.no_grad():
-            values = self.policy.value(*(th.as_tensor(x, device=self.device) for x in (states, actions))).cpu().numpy()
-        return values if env is None else env.unnormalize_reward(values)
+        def on_update(trainer: PlannerTrainer) -> None:
+            bar.update()
+            done = trainer.n_updates
+            is_end = done == total
+            if done % log_interval == 0 or is_end:
+                losses = trainer.pop_losses()
+                bar.set_postfix(loss=losses["planner/loss"])
+                errors = trainer.evaluate() if done % eval_interval == 0 or is_end else {}
+                for key, value in {**losses, **errors, "planner/n_updates": done}.items():
+                    self.logger.record(key, value)
+                self.logger.dump(self.num_timesteps + done)
+                if is_end and (worse := worse_than_regression(errors)):
+                    warnings.warn(
+                        f"On held-out windows the planner is still worse than a small regression: {worse}. It is "
+                        "undertrained; give it more planner_gradient_steps, or more data.",
+                        stacklevel=4,
+                    )
+            if checkpoint is not None and (done % save_interval == 0 or is_end):
+                save_tree(checkpoint, {**data, "trainer": trainer.state_dict()})
+
+        with tqdm(total=total, initial=trainer.n_updates, desc="planner", disable=not progress_bar) as bar:
+            try:
+                trainer.train(callback=on_update)
+            except KeyboardInterrupt:
+                print(f"Planner training interrupted after {trainer.n_updates} of {total} updates; its weights stay.")
+        if trainer.n_updates > 0:  # else an earlier training's stays
+            self.policy.planner_updates.fill_(float(trainer.n_updates))
+        self._planner_trained_at = self.num_timesteps
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
@@ -239,8 +281,6 @@ class SAID(DelayedSAC):
 
 def as_callback_list(callback: MaybeCallback) -> list[BaseCallback]:
     """Return callbacks in SB3's many forms as a list of callback objects."""
-    from stable_baselines3.common.callbacks import ConvertCallback
-
     if callback is None:
         return []
     if isinstance(callback, CallbackList):

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from sb3_said.delays.processes import age_range, make_process
+from sb3_said.delays.text import age_range, make_process
 
 #: A delay as YAML has it: control steps, [low, high], or a process as text; None for a task without the wrapper.
 Delay = int | list[int] | str | None

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_said.delays.processes import make_process
+from sb3_said.delays.text import make_process
 from sb3_said.evaluation import Summary, bootstrap_interval
 from sb3_said.files.atomic import write_json
 

@@ -12,10 +12,8 @@ from filelock import FileLock, Timeout
 from stable_baselines3.common.logger import Logger, make_output_format
 
 from sb3_said.files.archive import load_tree, save_tree
-from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner.config import SAMPLING_SETTINGS
-from sb3_said.said.callbacks import PLANNER_CHECKPOINT_NAME, PlannerTrainingCallback
-from sb3_said.said.said import SAID
+from sb3_said.said.said import PLANNER_CHECKPOINT_NAME, SAID
 from sb3_said.zoo.manager import log_suffix
 
 
@@ -100,7 +98,7 @@ class DepthPlanners:
     def _make_planner(self, depth: int) -> None:
         with th.random.fork_rng(devices=[]):  # the same weights to begin with, whichever worker trains them
             th.manual_seed(self.model.seed or 0)
-            make_planner(self.model, replace(self.config, depth=depth))
+            self.model.policy.make_planner(replace(self.config, depth=depth))
 
     def _train(self, depth: int) -> None:
         planner = self._own
@@ -132,7 +130,7 @@ class DepthPlanners:
         self.model.set_logger(Logger(str(folder), [log]))
         print(f"Training the planner of depth {depth}: {self.gradient_steps} updates", flush=True)
         try:
-            train_planner(self.model, self.gradient_steps, folder, self.progress_bar)
+            self.model.train_planner(self.gradient_steps, folder, self.progress_bar)
         finally:
             self.model.logger.close()
         if int(self.model.policy.planner_updates) < self.gradient_steps:
@@ -148,19 +146,3 @@ def check_same(what: str, before: dict[str, Any], now: dict[str, Any], advice: s
     if differing := [key for key in sorted({*before, *now}) if before.get(key) != now.get(key)]:
         changes = "; ".join(f"{key} was {before.get(key)} and is now {now.get(key)}" for key in differing)
         raise ValueError(f"{what} with other settings: {changes}. {advice}")
-
-
-def make_planner(model: SAID, config: PlannerConfig) -> None:
-    """Give an agent a new planner. MERGE: the call becomes ``self.model.policy.make_planner(config)``."""
-    policy, old = model.policy, model.policy.planner
-    policy.planner = InpaintingPlanner(old.obs_dim, old.act_dim, old.max_delay, config).to(old.device)
-    policy.planner.requires_grad_(False).train(False)
-    policy.planner_updates.zero_()
-    model.planner_kwargs = policy.planner_kwargs = config.to_dict()
-
-
-def train_planner(model: SAID, gradient_steps: int, folder: Path, progress_bar: bool) -> None:
-    """Train the planner with checkpoints. MERGE: ``model.train_planner(gradient_steps, folder, progress_bar)``."""
-    callback = PlannerTrainingCallback(folder=folder, progress_bar=progress_bar)
-    callback.init_callback(model)
-    callback.train_planner(gradient_steps)

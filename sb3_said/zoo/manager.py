@@ -21,7 +21,7 @@ from stable_baselines3.common.logger import Logger, make_output_format
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC, PlannerTrainingCallback
-from sb3_said.delays.processes import make_process
+from sb3_said.delays.text import make_process
 from sb3_said.files.atomic import write_json
 from sb3_said.files.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback, restore_training
 from sb3_said.zoo.arguments import Delay, largest_delay

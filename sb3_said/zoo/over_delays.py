@@ -18,7 +18,7 @@ from typing import Any
 import torch as th
 
 from sb3_said.delays import FixedDelay
-from sb3_said.delays.processes import age_range, make_process
+from sb3_said.delays.text import age_range, make_process
 from sb3_said.evaluation import Summary, plots
 from sb3_said.zoo.arguments import check_positive, explained, largest_delay, make_parser, read_delay
 from sb3_said.zoo.cells import Cell, Results, make_table, print_table
@@ -229,7 +229,7 @@ def obstacle(model: Any, answer: str | None, delay: int | str) -> str | None:
     longest = longest_delay(model) or 0
     if largest_delay(delay) > longest:
         return f"it was built for delays 0..{longest}"
-    if answer == "planner" and hasattr(model.policy.planner, "check_ages"):  # MERGE: without hasattr
+    if answer == "planner":
         low, high = age_range(delay)
         try:
             model.policy.planner.check_ages(list(range(low, high + 1)))

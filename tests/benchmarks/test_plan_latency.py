@@ -1,6 +1,7 @@
 """benchmarks/plan_latency.py: both ways do the same work, and the numbers are what they are called."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import plan_latency
@@ -8,8 +9,12 @@ import pytest
 import torch as th
 from torch.utils.flop_counter import FlopCounterMode
 
-SETTING = plan_latency.QUICK._replace(depth=2)
+SETTING = plan_latency.QUICK._replace(config=replace(plan_latency.QUICK.config, depth=2, precision="float32"))
 OBS, ACT = 11, 3  # Hopper-v5
+
+
+def changed(setting, **changes):
+    return setting._replace(config=replace(setting.config, **changes))
 
 
 def counted(function):
@@ -18,35 +23,39 @@ def counted(function):
     return {name: sum(flops.values()) for name, flops in counter.get_flop_counts().items()}
 
 
-@pytest.mark.parametrize("n_candidates", [1, 4])
-def test_both_ways_do_the_work_that_is_counted_from_shapes(n_candidates):
-    setting = SETTING._replace(n_candidates=n_candidates)
-    model = plan_latency.make_agent(setting, "cpu", precision="float32")
-    env = model.get_env().envs[0]
-    obs = plan_latency.observe(env, setting.delay)
-    assert obs["delay"] == setting.delay
-    plain = plan_latency.make_plain(setting, "cpu", env.action_space, env.observation_space["observation"])
-    flops = plan_latency.matmul_flops(setting, OBS, ACT)
+@pytest.mark.parametrize("scored_states", ["future", "decision", "all"])
+def test_both_ways_do_the_work_that_is_counted_from_shapes(scored_states):
+    ours, expected = [], []
+    for n_candidates, temperature in ((1, 0.0), (4, 0.5)):
+        setting = changed(SETTING, n_candidates=n_candidates, temperature=temperature, scored_states=scored_states)
+        model = plan_latency.make_agent(setting, "cpu")
+        env = model.get_env().envs[0]
+        obs = plan_latency.observe(env, setting.delay)
+        assert obs["delay"] == setting.delay
+        plain = plan_latency.make_plain(setting, "cpu", env)
+        flops = plan_latency.matmul_flops(setting, OBS, ACT)
 
-    model.warmup()
-    ours = counted(lambda: model.predict(obs, deterministic=True))
-    d_model, known = setting.d_model, OBS + setting.delay * (ACT + 1)
-    length = setting.delay + setting.horizon
-    context = 2 * (known * d_model + d_model * d_model + length * 2 * d_model)  # once a decision
-    assert ours["Global"] == flops + context
+        model.warmup()
+        ours.append(counted(lambda model=model, obs=obs: model.predict(obs, deterministic=True))["Global"])
+        expected.append(flops)
 
-    plain.planner.model_ema.train()  # the fused attention of evaluation is not counted
-    theirs = counted(lambda: plain(obs))
-    by_sample = ("modulation", "map_embedding", "time_embedding")  # for every candidate at every call
-    repeated = sum(n for name, n in theirs.items() if name.endswith(by_sample))
-    assert repeated > 0 and theirs["Global"] - repeated == flops
+        plain.planner.model_ema.train()  # the fused attention of evaluation is not counted
+        theirs = counted(lambda plain=plain, obs=obs: plain(obs))
+        by_sample = ("modulation", "map_embedding", "time_embedding")  # for every candidate at every call
+        repeated = sum(n for name, n in theirs.items() if name.endswith(by_sample))
+        assert repeated > 0 and theirs["Global"] - repeated == flops
+    assert ours[1] - ours[0] == expected[1] - expected[0]
+    beside = ours[0] - expected[0]  # once a decision, whatever the number of candidates
+    assert 0 < beside < expected[0]
 
 
 def test_flops_grow_with_each_size():
     base = plan_latency.matmul_flops(SETTING, OBS, ACT)
-    twice = plan_latency.matmul_flops(SETTING._replace(n_candidates=2 * SETTING.n_candidates), OBS, ACT)
+    twice = plan_latency.matmul_flops(changed(SETTING, n_candidates=2 * SETTING.n_candidates), OBS, ACT)
     assert twice == 2 * base
-    assert plan_latency.matmul_flops(plan_latency.SETTINGS[0], OBS, ACT) == pytest.approx(203.7e9, rel=0.01)
+    paper = plan_latency.SETTINGS[0]
+    assert plan_latency.matmul_flops(paper, OBS, ACT) == pytest.approx(203.8e9, rel=0.001)
+    assert plan_latency.matmul_flops(changed(paper, scored_states="future"), OBS, ACT) < 203.8e9
 
 
 def test_line_through_points():
@@ -57,19 +66,21 @@ def test_line_through_points():
 
 def test_quick_run_writes_what_it_prints(tmp_path, capsys):
     threads = th.get_num_threads()
-    plan_latency.main(["--quick", "--json", str(tmp_path / "latency.json")])
+    products = ["--product-size", "64", "--product-seconds", "0"]
+    plan_latency.main(["--quick", *products, "--json", str(tmp_path / "latency.json")])
     assert th.get_num_threads() == threads
     result = json.loads((tmp_path / "latency.json").read_text())
     (row,) = result["rows"]
     assert 0 < row["ours p50 ms"] <= row["p95"] <= row["p99"]
-    assert row["first"] > 0
+    assert row["first"] > 0 and row["of the floor"] > 0
     assert row["times as fast"]["low"] <= row["times as fast"]["value"] <= row["times as fast"]["high"]
-    assert 0 < row["of the floor"] < 1
-    assert {line["p50 in ms by"].split(",")[0] for line in result["scaling"]} == {
+    assert [line["p50 in ms by"] for line in result["scaling"]] == [
         "candidates",
         "denoising steps",
-        "environments",
-    }
+        "environments, batched",
+        "environments, deterministic",
+    ]
     assert all(np.isfinite(line["slope"]) for line in result["scaling"])
-    printed = capsys.readouterr().out
-    assert "quick: depth 1, width 32, 2 steps, 4 candidates" in printed and "environments, batched" in printed
+    captured = capsys.readouterr()
+    assert "quick: depth 1, width 32, 2 steps, 4 candidates" in captured.out
+    assert "environments, batched" in captured.out and captured.err.count("\n") == 1 + 1 + 4

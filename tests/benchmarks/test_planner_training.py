@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 
+import measure
 import planner_training
 import pytest
 from plain import PlainPlanner, WindowDataset, batches
@@ -28,16 +29,23 @@ def test_counted_work_is_done_both_ways(depth):
     assert theirs.get_total_flops() == pytest.approx(counted, rel=0.03)
 
 
-def test_rows_agree_with_what_was_measured(tmp_path, capsys):
+@pytest.mark.parametrize("bfloat16", [False, True])  # whatever this processor has: tiny products are cheap to emulate
+def test_rows_agree_with_what_was_measured(bfloat16, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(measure, "has_bfloat16", lambda device: bfloat16)
     file = tmp_path / "made" / "figures.json"
-    rows = planner_training.main(["--quick", "--num-threads", "1", "--json", str(file)])
+    tiny = ["--depth", "1", "--d-model", "32", "--batch-size", "8", "--rounds", "2", "--num-threads", "1"]
+    tiny += ["--product-size", "64", "--product-seconds", "0"]
+    rows = planner_training.main([*tiny, "--json", str(file)])
     written = json.loads(file.read_text())
-    assert [row["updates"] for row in rows] == ["plain", "ours, auto", "ours, float32"]
-    assert capsys.readouterr().out.count("\n") == 2 + len(rows)
+    formats = ["float32", "bfloat16"] if bfloat16 else ["float32"]
+    assert [row["updates"] for row in rows] == ["plain", *(f"ours, {name}" for name in formats)]
+    assert list(written["matmul_flops_per_second"]) == formats
+    captured = capsys.readouterr()
+    assert captured.out.count("\n") == 2 + len(rows) and "2 turns of one update at depth 1: plain" in captured.err
     for row, kept in zip(rows, written["rows"], strict=True):
         assert kept["p50_ms"] == row["p50_ms"] <= row["p95_ms"] <= row["p99_ms"]
         assert row["per second"] == pytest.approx(1000 / row["p50_ms"])
         assert kept["times plain"]["value"] == row["times plain"].value > 0
         assert row["fraction of floor"] == pytest.approx(row["floor_ms"] / row["p50_ms"])
-    assert rows[0]["floor_ms"] == rows[2]["floor_ms"] > 0  # both float32
+    assert rows[0]["floor_ms"] == rows[1]["floor_ms"] > 0  # both float32
     assert rows[0]["times plain"].value == 1.0

@@ -112,7 +112,7 @@ def test_actions_that_take_a_time_each(observation, action, receiver, spare, see
 
 def test_what_was_sent_is_no_history_where_every_action_takes_a_time_of_its_own():
     """An action that is held or overtaken is no step of the task between two states that are handed out."""
-    with pytest.raises(ValueError, match="what was sent between two states is not what was executed"):
+    with pytest.raises(ValueError, match="actions sent between two states are not those executed"):
         DelayedObservationWrapper(LoggedTask(), 2, WIFI_20MS, state_history=True)
     DelayedObservationWrapper(LoggedTask(), 2, (0, 3), state_history=True).reset(seed=0)
 

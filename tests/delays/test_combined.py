@@ -19,8 +19,9 @@ from sb3_said.delays import (
     TotalDelay,
     UniformDelay,
 )
-from sb3_said.delays.processes import age_range, packet_delays
+from sb3_said.delays.processes import packet_delays
 from sb3_said.delays.receivers import RECEIVERS
+from sb3_said.delays.text import age_range
 
 
 @pytest.mark.parametrize("inner", [-1, (4, 2), 1.5, None])

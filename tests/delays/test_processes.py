@@ -20,7 +20,8 @@ from sb3_said.delays import (
     UniformDelay,
     in_steps,
 )
-from sb3_said.delays.processes import make_process, packet_delays
+from sb3_said.delays.processes import packet_delays
+from sb3_said.delays.text import make_process
 
 # ---------------------------------------------------------------------------------------------------- writing
 
@@ -48,9 +49,9 @@ def test_whole_numbers_of_numpy_are_numbers():
     for process, expected in [
         (UniformDelay(low, high), "UniformDelay(low=1, high=8)"),
         (FixedDelay(high), "FixedDelay(delay=8)"),
-        (PeriodicPackets(2, high), "PeriodicPackets(process=2, period=8)"),
-        (DroppedPackets(2, 0.1, max_losses=high), "DroppedPackets(process=2, p=0.1, max_losses=8)"),
-        (HeldDelay(2, update_period=high), "HeldDelay(process=2, hold_prob=0.0, update_period=8)"),
+        (PeriodicPackets(2, high), "PeriodicPackets(process=FixedDelay(delay=2), period=8)"),
+        (DroppedPackets(2, 0.1, max_losses=high), "DroppedPackets(process=FixedDelay(delay=2), p=0.1, max_losses=8)"),
+        (HeldDelay(2, update_period=high), "HeldDelay(process=FixedDelay(delay=2), hold_prob=0.0, update_period=8)"),
     ]:
         assert repr(process) == expected and make_process(expected) == process
         for kwargs in ({"delay": process}, {"delay": 0, "action_delay": process}, {"delay": 0, "max_delay": high}):

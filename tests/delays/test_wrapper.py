@@ -311,9 +311,9 @@ def test_wide_bounds_become_infinite():
         ("observation_space", spaces.Box(-1, 1, ()), "FlattenObservation"),
         ("observation_space", spaces.Discrete(3), "FlattenObservation"),
         ("observation_space", spaces.Dict(a=spaces.Box(-1, 1, (3,))), "FlattenObservation"),
-        ("action_space", spaces.Discrete(3), "RescaleAction"),
-        ("action_space", spaces.Box(-np.inf, 1, (2,)), "RescaleAction"),
-        ("action_space", spaces.Box(-1, 1, (2, 2)), "RescaleAction"),
+        ("action_space", spaces.Discrete(3), "1-D Box action with finite bounds"),
+        ("action_space", spaces.Box(-np.inf, 1, (2,)), "1-D Box action with finite bounds"),
+        ("action_space", spaces.Box(-1, 1, (2, 2)), "1-D Box action with finite bounds"),
     ],
 )
 def test_other_spaces_are_refused_with_a_remedy(attribute, space, remedy):

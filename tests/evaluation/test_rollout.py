@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -148,12 +150,13 @@ def test_recurrent_states_of_sb3_contrib_are_cut_along_their_second_axis() -> No
     np.testing.assert_allclose(result.returns, by_hand(7)[0], rtol=1e-12)
 
 
-def test_latency_counts_every_call_but_the_warm_up() -> None:
+def test_latency_counts_every_call_but_the_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = SimpleNamespace(now=0.0, perf_counter=lambda: clock.now)  # no time depends on the machine
+    monkeypatch.setattr(importlib.import_module("sb3_said.evaluation.rollout"), "time", clock)
+
     class Slow(Model):
         def predict(self, observation, state=None, episode_start=None, deterministic=False):
-            import time
-
-            time.sleep((0.05, 0.02, 0.0, 0.0)[min(len(self.batches), 3)])  # warm-up, first measured call, the rest
+            clock.now += (0.5, 0.25, 0.125)[min(len(self.batches), 2)]  # warm-up, first measured call, the rest
             return super().predict(observation, state, episode_start)
 
     model = Slow()
@@ -161,8 +164,7 @@ def test_latency_counts_every_call_but_the_warm_up() -> None:
     assert observations["observation"].shape == (7, 2)
     latency = measure_latency(model, observations, n_calls=20)
     assert latency.n_calls == 20 and model.batches == [1] * 21
-    assert 0 < latency.p50_ms <= latency.p95_ms <= latency.p99_ms <= latency.max_ms
-    assert latency.p50_ms < 15 and 20 <= latency.max_ms
+    assert (latency.p50_ms, latency.p95_ms, latency.max_ms) == pytest.approx((125.0, 131.25, 250.0))
     with pytest.raises(ValueError, match="at least 1"):
         measure_latency(model, observations, n_calls=0)
 

@@ -40,10 +40,9 @@ def test_sinusoidal_positions_against_a_naive_loop():
     th.testing.assert_close(sinusoidal_positions(5, 8)[:, :4], expected)
 
 
-@pytest.mark.parametrize("positions", ["sinusoidal", "learned"])
 @pytest.mark.parametrize("embed_known", [True, False])
-def test_untrained_output_is_zero_but_learns(positions, embed_known):
-    network = make_network(randomised=False, positions=positions, embed_known=embed_known)
+def test_untrained_output_is_zero_but_learns(embed_known):
+    network = make_network(randomised=False, embed_known=embed_known)
     x, known, t = make_inputs()
     output = network(x, network.context(x, known), network.modulations(t))
     assert output.shape == x.shape and (output == 0).all()
@@ -151,5 +150,3 @@ def test_order_and_time_matter():
 def test_bad_arguments_are_refused():
     with pytest.raises(ValueError, match=r"d_model is 48, .* multiple of 32"):
         DiT1d(OBS, ACT, DELAY, LENGTH, d_model=48)
-    with pytest.raises(ValueError, match="positions is 'rotary', expected one of"):
-        DiT1d(OBS, ACT, DELAY, LENGTH, positions="rotary")

@@ -30,6 +30,7 @@ def train(source: WindowSource, **changes) -> PlannerTrainer:
     with th.random.fork_rng(devices=[]):
         th.manual_seed(0)
         config = PlannerConfig(
+            scored_states="future",  # the value reads no action
             depth=2,
             d_model=64,
             horizon=5,

@@ -10,12 +10,9 @@ import math
 import numpy as np
 import pytest
 import torch as th
-from hypothesis import given
-from hypothesis import strategies as st
 from linear_system import ACTION_DIM, STATE_DIM, make_source
 
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
-from sb3_said.planner.config import VALUE_SCALES
 from sb3_said.planner.diffusion import alpha_sigma, draw_times
 from sb3_said.planner.dit import HEAD_DIM
 from sb3_said.planner.inpainting import draw_delays
@@ -23,10 +20,9 @@ from sb3_said.planner.trainer import (
     PlannerTrainer,
     ema_decay,
     learning_rate,
-    value_rank,
-    value_weight,
     worse_than_regression,
 )
+from sb3_said.planner.values import VALUE_SCALES, scaled_values
 
 D = 3
 
@@ -61,35 +57,12 @@ def assert_same(first, second):
         assert th.equal(a, b) if isinstance(a, th.Tensor) else a == b, path
 
 
-def test_value_weight():
-    values = th.tensor([0.0, 0.25, 1.0])
-    expected = [math.exp(-2.0), math.exp(-1.5), 1.0]
-    np.testing.assert_allclose(value_weight(values, 2.0), expected, rtol=1e-6)
-    np.testing.assert_array_equal(value_weight(values, 0.0), np.ones(3))
-
-
-@given(st.lists(st.integers(-3, 3), min_size=1, max_size=30))
-def test_value_rank(values):
-    others = np.array(values)[:, None]  # (M, 1)
-    above = (others > values).sum(1) + ((others == values).sum(1) - 1) / 2
-    ranks = value_rank(th.tensor(values, dtype=th.float32))
-    np.testing.assert_allclose(ranks, above / max(1, len(values) - 1), rtol=1e-6)
-
-
-def test_ranks_weigh_alike_whatever_the_scale_of_values():
-    """One beta picks as much of data that is mostly bad as of data that is mostly good."""
-    values = th.rand(1000, generator=th.Generator().manual_seed(0), dtype=th.float64)
-    weights = value_weight(value_rank(values), 2.0)
-    for other in (values**4, 1 - (1 - values) ** 4, 5 * values - 3):
-        th.testing.assert_close(value_weight(value_rank(other), 2.0), weights)
-
-
 @pytest.mark.parametrize("scale", VALUE_SCALES)
 def test_windows_are_weighed_by_rank_or_range(scale):
-    trainer = make_trainer(value_scale=scale)
-    plain = make_trainer(value_scale="range").source
-    expected = value_rank(plain.values) if scale == "rank" else plain.values
-    assert th.equal(trainer.source.values, expected) and th.equal(trainer.source.rows, plain.rows)
+    source = make_source(40, 20)
+    trainer = make_trainer(value_scale=scale, source=source)
+    training, _ = source.split(0.1, 0)
+    assert th.equal(trainer.source.values, scaled_values(training.values, scale))
 
 
 def test_loss_receives_the_weights(monkeypatch):
@@ -129,7 +102,6 @@ OTHER_SETTINGS = {
     "depth": 2,
     "d_model": 64,
     "horizon": 4,
-    "positions": "learned",
     "embed_known": False,
     "prediction": "epsilon",
     "schedule": "linear",
@@ -141,8 +113,6 @@ OTHER_SETTINGS = {
     "relative_states": False,
     "decision_weight": 1.0,
     "action_transform": "tanh",
-    "solver": "dpmsolver++2m",
-    "time_grid": "log_snr",
     "sampling_steps": 4,
     "n_candidates": 3,
     "temperature": 0.5,
@@ -324,7 +294,7 @@ def test_steps_are_those_of_a_naive_float64_trainer(precision, tolerance):
 @pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
 def test_recorded_updates_are_those_made_one_kernel_at_a_time():
     trainers = [make_trainer(precision="float32", device="cuda") for _ in range(2)]
-    trainers[1]._captured = None  # launches every kernel
+    trainers[1]._recorded = None  # launches every kernel
     for trainer in trainers:
         trainer.train(8)
     for (path, recorded), (_, eager) in zip(*(leaves(t.state_dict()) for t in trainers), strict=True):
@@ -526,18 +496,6 @@ def test_training_resumes_under_other_sampling_settings():
     first.train(3)
     second.load_state_dict(first.state_dict())
     assert second.n_updates == 3
-
-
-def test_a_setting_that_a_file_is_older_than_counts_as_its_default():
-    first = make_trainer()
-    first.train(3)
-    old = first.state_dict()
-    del old["settings"]["config"]["extra_state_probability"]
-    second = make_trainer()
-    second.load_state_dict(old)
-    assert second.n_updates == 3
-    with pytest.raises(ValueError, match=r"extra_state_probability was 0\.0 and is now 0\.5"):
-        make_trainer(extra_state_probability=0.5).load_state_dict(old)
 
 
 def test_training_with_extra_states_resumes_bit_for_bit():

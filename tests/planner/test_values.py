@@ -1,95 +1,121 @@
-"""Values of stored steps, against loops that need no thought."""
+"""What windows weigh: returns to go against a walk through plain lists of episodes, scales and weights."""
+
+import math
 
 import numpy as np
 import pytest
+import torch as th
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 
-from sb3_said.planner.values import average_reward_tail, discounted_values, normalise_values
+from sb3_said.planner.values import VALUE_SCALES, returns_to_go, scaled_values, window_weight
+from sb3_said.replay.windows import WindowSource
 
-STEPS = st.integers(1, 30).flatmap(
-    lambda n_steps: st.integers(1, 3).flatmap(
-        lambda n_envs: st.tuples(
-            hnp.arrays(np.float32, (n_steps, n_envs), elements=st.floats(-10, 10, width=32)),
-            hnp.arrays(bool, (n_steps, n_envs)),
-            hnp.arrays(bool, (n_steps, n_envs)),
-            hnp.arrays(np.float32, (n_steps, n_envs), elements=st.floats(-100, 100, width=32)),
-        )
-    )
+EPISODES = st.lists(
+    st.tuples(st.lists(st.floats(-10, 10, width=32), min_size=1, max_size=12), st.booleans()), min_size=1, max_size=8
 )
 
 
-def naive_values(rewards, terminated, ends, tails, gamma):
-    """Sum forwards from every step to its episode's end."""
-    values = np.zeros(rewards.shape)
-    for start, env in np.ndindex(*rewards.shape):
-        factor, t = 1.0, start
-        while not ends[t, env]:
-            values[start, env] += factor * float(rewards[t, env])
-            factor, t = factor * gamma, t + 1
-        last = rewards[t, env] if terminated[t, env] else tails[t, env]
-        values[start, env] += factor * float(last)
-    return values
+def make_source(episodes):
+    """Lay episodes, lists of rewards and whether the task itself ended them, behind each other in a random order."""
+    rewards = th.tensor([r for rewards, _ in episodes for r in rewards])
+    number = th.cat([th.full((len(rewards),), i) for i, (rewards, _) in enumerate(episodes)])
+    remaining = th.cat([th.arange(len(rewards), 0, -1) for rewards, _ in episodes])
+    terminated = th.tensor([ended for _, ended in episodes])[number] & (remaining == 1)
+    n = len(rewards)
+    states = th.arange(float(n))[:, None, None]
+    order = th.randperm(n, generator=th.Generator().manual_seed(n))
+    starts = (order, th.zeros(n, dtype=th.int64), remaining[order], number[order], th.zeros(n))
+    return WindowSource(states, 0.5 * states, rewards[:, None], terminated[:, None], *starts)
 
 
-@settings(max_examples=60, deadline=None)
-@given(STEPS, st.sampled_from([0.0, 0.5, 0.99, 1.0]))
-def test_discounted_values_against_a_loop(steps, gamma):
-    rewards, ends, terminations, tails = steps
-    ends[-1] = True
-    terminated = ends & terminations
-    values = discounted_values(rewards, terminated, ends, tails, gamma)
-    assert values.dtype == np.float32
-    np.testing.assert_allclose(values, naive_values(rewards, terminated, ends, tails, gamma), rtol=1e-5, atol=1e-4)
+def naive_returns(episodes, gamma, penalty, value_fn):
+    returns, index = [], 0
+    for rewards, terminated in episodes:
+        index += len(rewards)
+        if terminated:
+            tail = rewards[-1] if penalty is None else penalty
+        else:
+            tail = np.mean(rewards) / (1 - gamma) if value_fn is None else 1.5 * (index - 1)
+        for t in range(len(rewards)):
+            value, factor = 0.0, 1.0
+            for reward in rewards[t:-1]:
+                value, factor = value + factor * reward, factor * gamma
+            returns.append(value + factor * tail)
+    return returns
 
 
-def test_discounted_values_by_hand():
-    rewards = np.array([[1.0], [2.0], [4.0], [8.0]], np.float32)
-    ends = np.array([[False], [True], [False], [True]])
-    terminated = np.array([[False], [True], [False], [False]])
-    tails = np.array([[9.0], [9.0], [9.0], [20.0]], np.float32)  # 20 is of the last step and all after it
-    values = discounted_values(rewards, terminated, ends, tails, 0.5)
-    assert values[:, 0].tolist() == [1 + 0.5 * 2, 2, 4 + 0.5 * 20, 20]
+def critic(states, actions):
+    return states[:, 0] + actions[:, 0]
 
 
-@settings(max_examples=40, deadline=None)
-@given(STEPS)
-def test_average_reward_tail_against_a_loop(steps):
-    rewards, ends, *_ = steps
-    ends[-1] = True
-    tails = average_reward_tail(rewards, ends, 0.9)
-    for env in range(rewards.shape[1]):
-        first = 0
-        for t in np.flatnonzero(ends[:, env]):
-            mean = np.mean(rewards[first : t + 1, env], dtype=np.float64)
-            np.testing.assert_allclose(tails[t, env], mean * 10, rtol=1e-4, atol=1e-4)
-            first = t + 1
+@settings(max_examples=80, deadline=None)
+@given(EPISODES, st.sampled_from([0.0, 0.5, 0.99]), st.sampled_from([None, -100.0]), st.sampled_from([None, critic]))
+def test_returns_against_a_walk_through_episodes(episodes, gamma, penalty, value_fn):
+    source = make_source(episodes)
+    returns = returns_to_go(source, gamma, penalty, value_fn)
+    assert returns.dtype == th.float32
+    expected = np.array(naive_returns(episodes, gamma, penalty, value_fn))[source.rows]
+    np.testing.assert_allclose(returns, expected, rtol=1e-4, atol=1e-3)
+
+
+def test_returns_by_hand():
+    source = make_source([([1.0, 2.0], True), ([4.0, 8.0], False)])
+    twenty = lambda states, actions: th.full((len(states),), 20.0)  # noqa: E731  # of the last step and all after it
+    returns = returns_to_go(source, 0.5, value_fn=twenty)
+    assert returns[source.rows.argsort()].tolist() == [1 + 0.5 * 2, 2, 4 + 0.5 * 20, 20]
 
 
 def test_an_endless_constant_reward_is_worth_the_geometric_series():
     # Every step of an episode cut by a time limit must look the same, near the limit or not.
-    rewards, ends = np.full((50, 1), 3.0, np.float32), np.zeros((50, 1), bool)
-    ends[-1] = True
-    values = discounted_values(rewards, np.zeros_like(ends), ends, average_reward_tail(rewards, ends, 0.99), 0.99)
-    np.testing.assert_allclose(values, 300.0, rtol=1e-5)
+    returns = returns_to_go(make_source([([3.0] * 50, False)]), 0.99)
+    np.testing.assert_allclose(returns, 300.0, rtol=1e-5)
 
 
-def test_no_discount_has_no_endless_value():
+def test_no_discount_needs_a_value_function():
+    source = make_source([([1.0, 1.0], False)])
     with pytest.raises(ValueError, match="gamma < 1"):
-        average_reward_tail(np.ones((3, 1), np.float32), np.ones((3, 1), bool), 1.0)
+        returns_to_go(source, 1.0)
+    assert sorted(returns_to_go(source, 1.0, value_fn=lambda s, a: th.full((len(s),), 7.0)).tolist()) == [7.0, 8.0]
 
 
-def test_normalise_values():
-    np.testing.assert_allclose(normalise_values(np.array([[-5.0], [0.0], [15.0]], np.float32)), [[0], [0.25], [1]])
-    constant = normalise_values(np.full((4, 2), -7.0, np.float32))
-    np.testing.assert_array_equal(constant, np.ones((4, 2)))
+def test_the_range_is_from_the_lowest_to_the_highest():
+    np.testing.assert_allclose(scaled_values(th.tensor([-5.0, 0.0, 15.0]), "range"), [0, 0.25, 1])
+    assert scaled_values(th.full((4,), -7.0), "range").tolist() == [1.0] * 4
 
 
-@settings(max_examples=60, deadline=None)
-@given(hnp.arrays(np.float32, st.integers(1, 20), elements=st.floats(-(2.0**100), 2.0**100, width=32)))
-def test_normalised_values_are_within_zero_and_one_and_in_order(values):
-    scaled = normalise_values(values)
-    assert scaled.dtype == np.float32 and scaled.min() >= 0 and scaled.max() == 1
-    order = np.argsort(values, kind="stable")
-    assert np.all(np.diff(scaled[order]) >= 0)
+@pytest.mark.parametrize("scale", VALUE_SCALES)
+@given(st.lists(st.floats(-(2.0**100), 2.0**100, width=32), min_size=1, max_size=20))
+def test_scaled_values_are_within_zero_and_one_and_in_order(scale, values):
+    values = th.tensor(values)
+    scaled = scaled_values(values, scale)
+    assert scaled.dtype == th.float32 and scaled.min() >= 0 and scaled.max() <= 1
+    assert (scaled[values.argsort()].diff() >= 0).all()
+
+
+def test_unknown_scales_are_refused():
+    with pytest.raises(ValueError, match="scale is 'log', expected one of"):
+        scaled_values(th.ones(2), "log")
+
+
+def test_window_weight_is_the_papers():
+    values = th.tensor([0.0, 0.25, 1.0])
+    expected = [math.exp(-2.0), math.exp(-1.5), 1.0]
+    np.testing.assert_allclose(window_weight(values, 2.0), expected, rtol=1e-6)
+    np.testing.assert_array_equal(window_weight(values, 0.0), np.ones(3))
+
+
+@given(st.lists(st.integers(-3, 3), min_size=1, max_size=30))
+def test_the_rank_is_the_part_of_the_others_below(values):
+    others = np.array(values)[:, None]  # (M, 1)
+    above = (others > values).sum(1) + ((others == values).sum(1) - 1) / 2
+    ranks = scaled_values(th.tensor(values, dtype=th.float32), "rank")
+    np.testing.assert_allclose(ranks, above / max(1, len(values) - 1), rtol=1e-6)
+
+
+def test_ranks_weigh_alike_whatever_the_scale_of_values():
+    """One beta picks as much of data that is mostly bad as of data that is mostly good."""
+    values = th.rand(1000, generator=th.Generator().manual_seed(0), dtype=th.float64)
+    weights = window_weight(scaled_values(values, "rank"), 2.0)
+    for other in (values**4, 1 - (1 - values) ** 4, 5 * values - 3):
+        th.testing.assert_close(window_weight(scaled_values(other, "rank"), 2.0), weights)

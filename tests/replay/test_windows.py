@@ -34,48 +34,36 @@ def naive_episodes(rows, env):
     return episodes
 
 
-def naive_starts(rows, n_envs, length, gamma=0.99, terminal_penalty=-100.0, value_fn=None):
-    """Map the tag of every stored state to (states, actions, n_valid, value), by walking through episodes."""
+def naive_starts(rows, n_envs, length):
+    """Map the tag of every stored state to (states, actions, n_valid, reward, ends there), walking through episodes."""
     starts = {}
     for env in range(n_envs):
         for steps, terminated in naive_episodes(rows, env):
             states = np.stack([row.states[env] for row in steps])
             # SB3's scaled action, executed and scaled back
             actions = np.stack([row.next_obs["action_history"][env, -1] for row in steps])
-            rewards = [float(row.reward[env]) for row in steps]
-            if terminated:
-                rewards[-1] = value = rewards[-1] if terminal_penalty is None else terminal_penalty
-            elif value_fn is not None:
-                value = float(value_fn(states[-1:], actions[-1:])[0])
-            else:
-                value = np.mean(rewards) / (1 - gamma)
-            for t in reversed(range(len(steps))):
-                value = value if t == len(steps) - 1 else rewards[t] + gamma * value
+            for t, row in enumerate(steps):
                 index = np.minimum(np.arange(t, t + length), len(steps) - 1)
-                n_valid = min(length, len(steps) - t)
-                starts[int(states[t, 0])] = states[index], actions[index], n_valid, value
+                n_valid, is_last = min(length, len(steps) - t), t == len(steps) - 1
+                starts[int(states[t, 0])] = (
+                    states[index], actions[index], n_valid, float(row.reward[env]), terminated and is_last
+                )  # fmt: skip
     return starts
 
 
 def assert_windows(source, starts, length):
-    """Compare every window there is with the naive ones; values after scaling both to [0, 1]."""
+    """Compare every window there is with the naive ones."""
     windows = source.gather(th.arange(len(source)), length)
     tags = windows.states[:, 0, 0].int().tolist()
     assert sorted(tags) == sorted(starts)  # each stored step starts one window: no episode is too short
-    states, actions, n_valid, values = (np.stack(x) for x in zip(*[starts[tag] for tag in tags], strict=True))
+    states, actions, n_valid, rewards, ended = (np.stack(x) for x in zip(*[starts[tag] for tag in tags], strict=True))
     np.testing.assert_array_equal(windows.states, states)
     np.testing.assert_array_equal(windows.actions, actions)
     np.testing.assert_array_equal(windows.valid, np.arange(length) < n_valid[:, None])
-    spread = values.max() - values.min()
-    scaled = (values - values.min()) / spread if spread > 0 else np.ones_like(values)
-    # Large values close together lose digits
-    rounding = np.finfo(np.float32).eps * np.abs(values).max() / spread if spread > 0 else 0.0
-    np.testing.assert_allclose(windows.values, scaled, atol=1e-5 + 4 * rounding)
+    np.testing.assert_array_equal(source.rewards[source.rows, source.envs], rewards.astype(np.float32))
+    np.testing.assert_array_equal(source.terminated[source.rows, source.envs], ended)
+    assert (windows.values == 0).all()
     assert [x.dtype for x in windows] == [th.float32, th.float32, th.bool, th.float32]
-
-
-def critic(states, actions):
-    return 50 * states[:, 1] + 10 * actions[:, 0]
 
 
 @settings(max_examples=150, deadline=None)
@@ -88,39 +76,18 @@ def critic(states, actions):
     steps_per_env=st.integers(5, 40),
     length=st.integers(1, 15),
     newest_fraction=st.sampled_from([1.0, 0.5, 0.2, 0.001]),
-    value_fn=st.sampled_from([None, critic]),
     seed=st.integers(0, 2**16),
 )
 def test_every_window_is_a_piece_of_one_episode(
-    n_envs, delay, max_length, interruption, n_steps, steps_per_env, length, newest_fraction, value_fn, seed
+    n_envs, delay, max_length, interruption, n_steps, steps_per_env, length, newest_fraction, seed
 ):
     player = Player(n_envs, delay, 3, max_length=max_length, interruption=interruption, seed=seed)
     rows = player.play(n_steps)
-    source = make_buffer(player, steps_per_env, rows).window_source(newest_fraction, value_fn=value_fn)
+    source = make_buffer(player, steps_per_env, rows).window_source(newest_fraction)
     n_rows = max(int(min(n_steps, steps_per_env) * newest_fraction), 1)
-    assert_windows(source, naive_starts(rows[-n_rows:], n_envs, length, value_fn=value_fn), length)
+    assert_windows(source, naive_starts(rows[-n_rows:], n_envs, length), length)
     # Episodes are numbered apart, also where two end at the same time
     assert len(source.episodes.unique()) == sum(len(naive_episodes(rows[-n_rows:], env)) for env in range(n_envs))
-
-
-@pytest.mark.parametrize(("gamma", "terminal_penalty"), [(0.5, -100.0), (0.99, 0.0), (0.9, 30.0), (0.9, None)])
-def test_discount_and_terminal_penalty(gamma, terminal_penalty):
-    player = Player(max_length=15)
-    rows = player.play(60)
-    source = make_buffer(player, 60, rows).window_source(gamma=gamma, terminal_penalty=terminal_penalty)
-    assert_windows(source, naive_starts(rows, 2, 5, gamma, terminal_penalty), 5)
-
-
-def test_no_discount_needs_a_value_function():
-    player = Player(max_length=15)
-    rows = player.play(40)
-    buffer = make_buffer(player, 60, rows)
-    with pytest.raises(ValueError, match="gamma"):
-        buffer.window_source(gamma=1.0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        source = buffer.window_source(gamma=1.0, value_fn=critic)
-    assert_windows(source, naive_starts(rows, 2, 5, 1.0, value_fn=critic), 5)
 
 
 @pytest.mark.parametrize("fraction", [0.0, -0.2, 1.1, float("nan")])
@@ -139,6 +106,7 @@ def test_without_a_warning_and_over_the_buffers_own_memory(n_envs):
         source = buffer.window_source()
     assert source.states.data_ptr() == buffer.observations.ctypes.data
     assert source.actions.data_ptr() == buffer.actions.ctypes.data
+    assert source.rewards.data_ptr() == buffer.rewards.ctypes.data
     for name in ("rows", "envs", "remaining", "values", "episodes"):
         assert getattr(source, name).numpy().flags.writeable
 
@@ -169,9 +137,9 @@ def make_source(lengths):
     states = th.stack([episodes, steps], dim=1).float()[:, None]
     remaining = th.tensor(lengths)[episodes] - steps
     n = len(episodes)
-    return WindowSource(
-        states, -states[..., :1], th.arange(n), th.zeros(n, dtype=th.int64), remaining, steps / max(lengths), episodes
-    )
+    none = th.zeros(n, 1)
+    starts = th.arange(n), th.zeros(n, dtype=th.int64), remaining, episodes, steps / max(lengths)
+    return WindowSource(states, -states[..., :1], none, none.bool(), *starts)
 
 
 def test_sample_is_uniform_over_steps_and_repeats_with_a_generator():
@@ -241,7 +209,7 @@ def test_sample_windows_of_the_buffer():
     windows = make_buffer(player, 20, rows).sample_windows(64, 5, th.Generator().manual_seed(0))
     starts = naive_starts(rows[-20:], 2, 5)
     for states, actions, valid in zip(windows.states, windows.actions, windows.valid, strict=True):
-        expected_states, expected_actions, n_valid, _ = starts[int(states[0, 0])]
+        expected_states, expected_actions, n_valid, *_ = starts[int(states[0, 0])]
         np.testing.assert_array_equal(states, expected_states)
         np.testing.assert_array_equal(actions, expected_actions)
         assert valid.sum() == n_valid

@@ -12,10 +12,9 @@ from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import KVWriter, Logger
 
 from sb3_said import SAID, DelayedObservationWrapper, PlannerTrainingCallback
-from sb3_said.files.agents import load_tree, save_tree
 from sb3_said.files.checkpoint import TrainingCheckpointCallback, restore_training
 from sb3_said.planner.trainer import PlannerTrainer
-from sb3_said.said.callbacks import PLANNER_CHECKPOINT_NAME
+from sb3_said.said.said import PLANNER_CHECKPOINT_NAME
 
 PLANNER = {"d_model": 32, "depth": 1, "horizon": 3, "batch_size": 16, "sampling_steps": 2, "n_candidates": 3}
 
@@ -23,7 +22,12 @@ PLANNER = {"d_model": 32, "depth": 1, "horizon": 3, "batch_size": 16, "sampling_
 def make(**kwargs):
     env = DelayedObservationWrapper(gym.make("Pendulum-v1", max_episode_steps=15), 2)
     arguments = {"learning_starts": 20, "batch_size": 16, "buffer_size": 500, "seed": 0, "device": "cpu"}
-    arguments |= {"policy_kwargs": {"net_arch": [16]}, "planner_kwargs": PLANNER, "planner_gradient_steps": 6}
+    arguments |= {
+        "policy_kwargs": {"net_arch": [16]},
+        "planner_kwargs": PLANNER,
+        "planner_gradient_steps": 6,
+        "planner_newest_fraction": 1.0,
+    }
     return SAID("MlpPolicy", env, **(arguments | kwargs))
 
 
@@ -255,11 +259,6 @@ def test_a_checkpoint_of_other_settings_is_refused(tmp_path):
         make(planner_gradient_steps=7).learn(40, PlannerTrainingCallback(folder=tmp_path))
 
 
-def test_a_checkpoint_that_does_not_name_its_data_is_gone_on_from(tmp_path, trainings):
-    make().learn(40, PlannerTrainingCallback(folder=tmp_path))
-    path = tmp_path / PLANNER_CHECKPOINT_NAME
-    old = {key: value for key, value in load_tree(path).items() if key != "replay"}
-    save_tree(path, old)
-    trainings.clear()
-    assert make().learn(40, PlannerTrainingCallback(folder=tmp_path)).policy.planner_updates == 6
-    assert not trainings
+def test_unknown_intervals_are_refused_before_the_training():
+    with pytest.raises(TypeError, match="no argument save_freq"):
+        PlannerTrainingCallback(save_freq=5)

@@ -81,15 +81,20 @@ def test_callbacks_are_answered_by_the_expert_while_learning(trained, tmp_path):
 # ---------------------------------------------------------------------------------------------------- settings
 
 
+def settings(**changes):
+    """Every setting of the small planner."""
+    return PlannerConfig(**PLANNER | changes).to_dict()
+
+
 def test_how_the_planner_answers_can_be_changed_and_is_saved(saved, tmp_path):
     model, obs = SAID.load(saved, device="cpu"), observe()
     before = answer(model, obs)
-    assert model.planner_kwargs == PLANNER
+    assert model.planner_kwargs == settings()
     model.set_planner(temperature=3.0, n_candidates=9, sampling_steps=3)
     assert not np.allclose(answer(model, obs), before)
     model.set_planner(temperature=0.3)
     changes = {"temperature": 0.3, "n_candidates": 9, "sampling_steps": 3}
-    assert model.planner_kwargs == PLANNER | changes
+    assert model.planner_kwargs == settings(**changes)
     model.save(tmp_path / "changed")
     again = SAID.load(tmp_path / "changed", env=delayed(), device="cpu")
     assert again.policy.planner.config == PlannerConfig(**PLANNER | changes)
@@ -99,21 +104,21 @@ def test_how_the_planner_answers_can_be_changed_and_is_saved(saved, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"),
+    ("given", "message"),
     [
         ({"depth": 2}, "got depth"),
         ({"temperature": -1.0}, "temperature is -1"),
         ({"n_candidates": 0}, "n_candidates is 0"),
         ({"temprature": 0.5}, "got temprature"),
-        ({"solver": "euler"}, "solver"),
+        ({"scored_states": "past"}, "scored_states"),
     ],
 )
-def test_settings_that_cannot_be_changed_are_refused(saved, settings, message):
+def test_settings_that_cannot_be_changed_are_refused(saved, given, message):
     model = SAID.load(saved, device="cpu")
     before = answer(model, observe())
     with pytest.raises(ValueError, match=message):
-        model.set_planner(**settings)
-    assert model.planner_kwargs == PLANNER and np.array_equal(answer(model, observe()), before)
+        model.set_planner(**given)
+    assert model.planner_kwargs == settings() and np.array_equal(answer(model, observe()), before)
 
 
 @pytest.mark.parametrize(
@@ -138,10 +143,10 @@ def test_every_argument_has_a_default_and_is_an_attribute():
     own = [p for p in parameters if p.kind is not p.VAR_KEYWORD]
     given = {
         "learning_rate": 0.01,
-        "planner_kwargs": PLANNER,
+        "planner_kwargs": settings(),
         "planner_gradient_steps": 7,
         "planner_train_freq": 9,
-        "planner_newest_fraction": 0.2,
+        "planner_newest_fraction": 0.3,
         "planner_terminal_penalty": None,
     }
     assert [p.name for p in own] == list(given) and all(p.default is not p.empty for p in own)
@@ -201,7 +206,7 @@ def test_only_a_planner_of_every_delay_takes_another_one_silently(trained, saved
 
 @pytest.mark.parametrize("delay", [(0, 2), 1, UniformDelay(1, 2)])
 def test_a_planner_for_one_age_refuses_environments_of_others(delay, tmp_path):
-    with pytest.warns(UserWarning, match="mask='fixed' answers at age 2 only"):  # the expert may learn there
+    with pytest.warns(UserWarning, match="mask='fixed' plans at age 2 only"):  # the expert may learn there
         make(delayed(delay, max_delay=2), planner_kwargs={"mask": "fixed"})
     model = make(planner_kwargs={"mask": "fixed"}).learn(60)
     model.save(tmp_path / "agent")
@@ -211,7 +216,7 @@ def test_a_planner_for_one_age_refuses_environments_of_others(delay, tmp_path):
     ):
         with (
             warnings.catch_warnings(),
-            pytest.raises(ValueError, match="mask='fixed' answers at age 2 only, but this environment"),
+            pytest.raises(ValueError, match="mask='fixed' plans at age 2 only"),
         ):
             warnings.simplefilter("error")
             take()
@@ -233,12 +238,12 @@ def test_parameters_and_policy_are_taken_over(trained, tmp_path):
 def test_a_file_brings_its_settings_whatever_the_defaults_are_then(trained, saved, monkeypatch):
     expected, names = trained.policy.planner.config, [field.name for field in fields(PlannerConfig)]
     defaults = list(PlannerConfig.__init__.__defaults__)
-    others = {"scored_states": "all", "solver": "dpmsolver++2m", "embed_known": False}
+    others = {"sampling_steps": 9, "choice_factor": 2.0, "embed_known": False}
     for name, value in others.items():
-        assert getattr(expected, name) == defaults[names.index(name)] != value
+        assert getattr(expected, name) != value
         defaults[names.index(name)] = value
     monkeypatch.setattr(PlannerConfig.__init__, "__defaults__", tuple(defaults))
-    assert PlannerConfig().solver == "dpmsolver++2m"
+    assert PlannerConfig().choice_factor == 2.0
     loaded = SAID.load(saved, device="cpu")
     assert loaded.policy.planner.config == expected
     assert np.array_equal(answer(loaded, observe()), answer(trained, observe()))
@@ -333,11 +338,10 @@ def test_normalized_tasks(env):
     scaled = np.clip((states - rms.mean) / np.sqrt(rms.var + vec_env.epsilon), -10, 10)
     source = model.make_planner_trainer().source
     np.testing.assert_allclose(source.states[: buffer.size()], scaled, rtol=1e-4, atol=1e-6)
-    values = model._stored_values(states[:, 0], buffer.actions[: buffer.size(), 0])
+    pairs = source.states[: buffer.size(), 0], source.actions[: buffer.size(), 0]
+    values = model._stored_values(*pairs)
     with th.no_grad():
-        critic = model.policy.value(
-            th.as_tensor(scaled[:, 0], dtype=th.float32), th.as_tensor(buffer.actions[: len(states), 0])
-        )
+        critic = model.policy.value(*pairs)
     np.testing.assert_allclose(values, critic * np.sqrt(vec_env.ret_rms.var + vec_env.epsilon), rtol=1e-4, atol=1e-5)
 
 

@@ -33,7 +33,7 @@ def cost(state: th.Tensor, action: th.Tensor) -> th.Tensor:
 
 
 def make_source(n_episodes: int = 400, length: int = 40, seed: int = 0, process_noise: float = 0.0) -> WindowSource:
-    """Return windows of the behaviour policy; values are the best cost-to-go, turned to [0, 1].
+    """Return windows of the behaviour policy; values are the best cost-to-go, negated.
 
     :param process_noise: standard deviation of what is added to each entry of every next state
     """
@@ -49,17 +49,19 @@ def make_source(n_episodes: int = 400, length: int = 40, seed: int = 0, process_
         if process_noise > 0:
             state = state + process_noise * th.randn(n_episodes, STATE_DIM, generator=generator)
     stacked = th.stack(states)  # (length, n_episodes, STATE_DIM): one row per step, one environment per episode
-    value = -(stacked @ riccati()[1] * stacked).sum(-1).flatten()
+    value = -(stacked @ riccati()[1] * stacked).sum(-1)
     rows = th.arange(length).repeat_interleave(n_episodes)
     envs = th.arange(n_episodes).repeat(length)
     return WindowSource(
         states=stacked,
         actions=th.stack(actions),
+        rewards=th.zeros(length, n_episodes),
+        terminated=th.zeros(length, n_episodes, dtype=th.bool),
         rows=rows,
         envs=envs,
         remaining=length - rows,
-        values=(value - value.min()) / (value.max() - value.min()),
         episodes=envs.clone(),
+        values=value.flatten(),
     )
 
 

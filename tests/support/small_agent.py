@@ -13,6 +13,7 @@ PLANNER = {
     "sampling_steps": 2,
     "n_candidates": 4,
     "temperature": 0.5,
+    "scored_states": "future",
 }
 
 
@@ -20,7 +21,11 @@ def make(env=None, cls=SAID, policy="MlpPolicy", planner_kwargs=(), **kwargs):
     arguments = {"learning_starts": 20, "batch_size": 16, "buffer_size": 500, "seed": 0, "device": "cpu"}
     arguments["policy_kwargs"] = {"net_arch": [32]}
     if cls is SAID:
-        arguments |= {"planner_kwargs": PLANNER | dict(planner_kwargs), "planner_gradient_steps": 5}
+        arguments |= {
+            "planner_kwargs": PLANNER | dict(planner_kwargs),
+            "planner_gradient_steps": 5,
+            "planner_newest_fraction": 1.0,
+        }
     return cls(policy, delayed() if env is None else env, **(arguments | kwargs))
 
 

@@ -9,7 +9,14 @@ from sb3_said.replay.windows import Windows
 
 OBS, ACT, DELAY = 3, 2, 4
 SMALL = PlannerConfig(
-    depth=2, d_model=32, horizon=4, precision="float32", sampling_steps=3, n_candidates=5, temperature=0.5
+    depth=2,
+    d_model=32,
+    horizon=4,
+    precision="float32",
+    sampling_steps=3,
+    n_candidates=5,
+    temperature=0.5,
+    scored_states="future",
 )
 LENGTH = DELAY + SMALL.horizon
 

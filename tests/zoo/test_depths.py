@@ -15,8 +15,6 @@ from filelock import FileLock
 
 from sb3_said import SAID, PlannerConfig
 from sb3_said.files.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback
-from sb3_said.said import said as said_module
-from sb3_said.zoo import depths
 from sb3_said.zoo.depths import DepthPlanners
 
 STEPS = 3
@@ -94,9 +92,7 @@ def test_a_killed_training_goes_on_bit_for_bit(run, tmp_path, monkeypatch):
     whole = make(run, tmp_path / "whole", 6)
     whole.train([2])
     whole.put(2)
-    for module in (depths, said_module):
-        callback = functools.partial(module.PlannerTrainingCallback, save_interval=2)
-        monkeypatch.setattr(module, "PlannerTrainingCallback", callback)
+    monkeypatch.setattr(SAID, "train_planner", functools.partialmethod(SAID.train_planner, save_interval=2))
     make_trainer, calls = SAID.make_planner_trainer, []
 
     def stopping(self, gradient_steps=None):
@@ -142,7 +138,7 @@ def test_a_replay_of_another_step_is_refused(run, tmp_path):
 
 def test_how_a_planner_answers_is_no_matter_of_its_training(run, tmp_path, capsys):
     make(run, tmp_path, 2).train([2])
-    again = make(run, tmp_path, 2, n_candidates=3, solver="dpmsolver++2m")
+    again = make(run, tmp_path, 2, n_candidates=3, scored_states="all")
     again.train([2])
     again.put(2, temperature=0.1, sampling_steps=4)
     assert trainings(capsys) == 1  # the same weights, other answers
@@ -169,7 +165,7 @@ def test_planners_have_the_runs_settings_whatever_the_defaults_are_then(run, tmp
     expected.put(2)
     defaults = list(PlannerConfig.__init__.__defaults__)
     names = [field.name for field in fields(PlannerConfig)]
-    for name, value in {"embed_known": False, "solver": "dpmsolver++2m"}.items():
+    for name, value in {"embed_known": False, "scored_states": "all"}.items():
         assert defaults[names.index(name)] != value
         defaults[names.index(name)] = value
     monkeypatch.setattr(PlannerConfig.__init__, "__defaults__", tuple(defaults))

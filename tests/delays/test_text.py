@@ -9,12 +9,13 @@ from sb3_said.delays import (
     WIFI_20MS,
     DelayedObservationWrapper,
     DroppedPackets,
+    EpisodeDelay,
     FixedDelay,
     HeldDelay,
     TotalDelay,
     UniformDelay,
 )
-from sb3_said.delays.written import parse_process
+from sb3_said.delays.text import make_process, parse_process
 
 
 @settings(deadline=None)
@@ -29,6 +30,8 @@ def test_processes_of_processes():
     )
     held = parse_process("HeldDelay(TotalDelay(WIFI_20MS, (0, 2)), hold_prob=0.5)")
     assert held == HeldDelay(TotalDelay(WIFI_20MS, (0, 2)), hold_prob=0.5)
+    assert make_process("DroppedPackets([0, 4], p=0.1)") == DroppedPackets(EpisodeDelay(0, 4), p=0.1)
+    assert hash(DroppedPackets([0, 4], p=0.1)) == hash(DroppedPackets((0, 4), p=0.1))  # YAML has no tuples
 
 
 @pytest.mark.parametrize(

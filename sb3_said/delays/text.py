@@ -1,4 +1,4 @@
-"""Delay processes written as text, for command lines and YAML: no code is run to read one."""
+"""Delays as users write them on command lines and in YAML, text among them; reading a text runs no code."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import ast
 from typing import Any
 
 from sb3_said.delays import combined, processes
-from sb3_said.delays.processes import DelayProcess
+from sb3_said.delays.processes import Delay, DelayProcess, as_process, smallest_age
 
 #: What a text may call, and the names it may use.
 CLASSES: dict[str, type[Any]] = {
@@ -24,6 +24,28 @@ CLASSES: dict[str, type[Any]] = {
     )
 }
 CONSTANTS: dict[str, DelayProcess] = {"WIFI_20MS": processes.WIFI_20MS}
+_EXAMPLE = '"DroppedPackets(UniformDelay(0, 8), p=0.1)"'
+
+
+def make_process(delay: Delay | str) -> DelayProcess:
+    """Turn what a user writes as ``delay`` into a process.
+
+    :param delay: an integer (fixed), a ``(low, high)`` pair (drawn anew each episode), a process, or any of these as
+        text (:func:`parse_process`)
+    :raises ValueError: for anything else
+    """
+    return as_process(parse_process(delay) if isinstance(delay, str) else delay)
+
+
+def age_range(delay: Delay | str) -> tuple[int, int]:
+    """Return the smallest and the largest age amid an episode, in control steps.
+
+    An episode's start has smaller ones. A user's own process without ``min_delay`` may bring any up to ``max_delay``.
+
+    :param delay: as :func:`make_process` takes it
+    """
+    process = make_process(delay)
+    return smallest_age(process), process.max_delay
 
 
 def parse_process(text: str) -> int | tuple[int, int] | DelayProcess:
@@ -32,8 +54,8 @@ def parse_process(text: str) -> int | tuple[int, int] | DelayProcess:
     :param text: such as ``"4"``, ``"WIFI_20MS"`` or ``"DroppedPackets(UniformDelay(0, 8), p=0.1)"``
     :raises ValueError: for anything but these names, calls of them, and numbers
 
-    >>> parse_process("DroppedPackets(4, p=0.1)")
-    DroppedPackets(process=4, p=0.1, max_losses=4)
+    >>> parse_process("DroppedPackets((0, 4), p=0.1)")
+    DroppedPackets(process=EpisodeDelay(low=0, high=4), p=0.1, max_losses=4)
     """
     try:
         return _evaluate(ast.parse(text.strip(), mode="eval").body)
@@ -41,9 +63,6 @@ def parse_process(text: str) -> int | tuple[int, int] | DelayProcess:
         raise ValueError(
             f"{text!r} is no delay: {error}. Write it as in docs/delays.md, such as {_EXAMPLE}."
         ) from error
-
-
-_EXAMPLE = '"DroppedPackets(UniformDelay(0, 8), p=0.1)"'
 
 
 def _evaluate(node: ast.expr) -> Any:
