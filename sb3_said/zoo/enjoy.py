@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 from importlib.util import find_spec
@@ -11,20 +10,19 @@ from typing import Any
 
 import gymnasium as gym
 
-from sb3_said.evaluation import rollout
-from sb3_said.zoo.manager import add_delay, read_delay
+from sb3_said.zoo.arguments import add_run, check_positive, explained, make_parser, read_delay
 from sb3_said.zoo.runs import ANSWERS, answering, load_run
 
 EPILOG = """\
 examples:
   # three episodes in a window
-  python scripts/enjoy.py logs/said/Hopper-v5-delay4_1 --episodes 3
+  sb3-said enjoy logs/said/Hopper-v5-delay4_1 --episodes 3
 
   # a video at real speed, on a machine without a display
-  python scripts/enjoy.py logs/said/Hopper-v5-delay4_1 --record hopper.mp4
+  sb3-said enjoy logs/said/Hopper-v5-delay4_1 --record hopper.mp4
 
   # the expert from the same starts, as a GIF
-  python scripts/enjoy.py logs/said/Hopper-v5-delay4_1 --answer expert --record hopper_expert.gif
+  sb3-said enjoy logs/said/Hopper-v5-delay4_1 --answer expert --record hopper_expert.gif
 
 Without a display, MuJoCo draws through EGL (Debian, Ubuntu: apt-get install libegl1 libgl1-mesa-dri), or in software
 with MUJOCO_GL=osmesa (libosmesa6). Videos need the extra sb3_said[video].
@@ -32,26 +30,7 @@ A run folder's YAML can run code (rl_zoo3 reads it so): open only folders that y
 """
 
 
-def make_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("run", metavar="RUN_OR_ZIP", help="run folder of a training, or an agent's .zip")
-    parser.add_argument("--record", type=Path, metavar="FILE", help="write a video (.mp4 or .gif) instead of a window")
-    parser.add_argument("--fps", type=int, default=25, help="frames a second of the video; it plays in real time, "
-                        "by leaving out steps (default: 25)")  # fmt: skip
-    parser.add_argument("--episodes", type=int, default=1, help="whole episodes (default: 1)")
-    parser.add_argument("--seed", type=int, default=10_000, help="reset seed of the first episode (default: 10000)")
-    parser.add_argument("--answer", choices=ANSWERS, help="who acts in a SAID agent (default: the agent)")
-    parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the best")
-    parser.add_argument("--algo", help="algorithm of a .zip without its run folder")
-    parser.add_argument("--env", help="task to play (default: the trained one)")
-    add_delay(parser, default="the trained one")
-    parser.add_argument("--device", default="auto", help="torch device (default: auto)")
-    return parser
-
-
-class CannotDraw(RuntimeError):
+class CannotDraw(ImportError):
     """The task cannot be drawn on this machine.
 
     :param cause: what the graphics library said; MuJoCo's and pygame's backends each fail in their own way
@@ -63,15 +42,6 @@ class CannotDraw(RuntimeError):
             "MuJoCo needs a GL library; on Debian or Ubuntu: apt-get install libegl1 libgl1-mesa-dri and "
             "MUJOCO_GL=egl, or apt-get install libosmesa6 and MUJOCO_GL=osmesa. Other tasks may need pygame."
         )
-
-
-def follow(env: gym.Env[Any, Any]) -> None:
-    """Use a MuJoCo task's own tracking camera, where the default one stays behind while the robot runs away."""
-    renderer = getattr(getattr(env, "unwrapped", None), "mujoco_renderer", None)
-    if renderer is not None and renderer.camera_id in (None, -1):
-        import mujoco
-
-        renderer.camera_id = mujoco.mj_name2id(renderer.model, mujoco.mjtObj.mjOBJ_CAMERA, "track")  # -1: has none
 
 
 class Video:
@@ -106,31 +76,42 @@ class Video:
         except Exception as error:
             raise CannotDraw(error) from error
         if self._writer is None:
-            self._writer = self._open()
+            self._open()
         self._writer.append_data(frame)
         self.frames += 1
+
+    def _open(self) -> None:
+        import imageio
+
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        is_gif = self.path.suffix == ".gif"
+        how = {"mode": "I", "duration": 1000 / self.fps, "loop": 0} if is_gif else {"fps": self.fps}
+        self._writer = imageio.get_writer(self.path, **how)
 
     def close(self) -> None:
         if self._writer is not None:
             self._writer.close()
 
-    def _open(self) -> Any:
-        import imageio
 
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        if self.path.suffix == ".gif":
-            return imageio.get_writer(self.path, mode="I", duration=1000 / self.fps, loop=0)
-        return imageio.get_writer(self.path, fps=self.fps)
+def follow(env: gym.Env[Any, Any]) -> None:
+    """Use a MuJoCo task's own tracking camera, where the default one stays behind while the robot runs away."""
+    renderer = getattr(getattr(env, "unwrapped", None), "mujoco_renderer", None)
+    if renderer is not None and renderer.camera_id in (None, -1):
+        import mujoco
+
+        renderer.camera_id = mujoco.mj_name2id(renderer.model, mujoco.mjtObj.mjOBJ_CAMERA, "track")  # -1: has none
 
 
-def check_can_record() -> None:
+def check_can_record(path: Path) -> None:
     """Fail before an agent is loaded, with what to install.
 
-    :raises ModuleNotFoundError: without imageio
-    :raises CannotDraw: when MuJoCo cannot load the library that MUJOCO_GL names
+    :raises ValueError: for a file that is no video
+    :raises ImportError: without imageio, or when MuJoCo cannot load the library that MUJOCO_GL names
     """
+    if path.suffix not in (".mp4", ".gif"):
+        raise ValueError(f"--record takes a file ending in .mp4 or .gif, got {path}.")
     if any(find_spec(package) is None for package in ("imageio", "imageio_ffmpeg")):
-        raise ModuleNotFoundError('Videos need imageio and imageio-ffmpeg: pip install "sb3_said[video]"')
+        raise ImportError('Videos need imageio and imageio-ffmpeg: pip install "sb3_said[video]"')
     try:
         import mujoco  # noqa: F401  # loads the GL library
     except Exception as error:
@@ -138,47 +119,37 @@ def check_can_record() -> None:
 
 
 def main(argv: list[str] | None = None) -> None:
-    parser = make_parser()
-    args = parser.parse_args(argv)
-    has_display = not sys.platform.startswith("linux") or bool(
-        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    parser = make_parser(__doc__, EPILOG)
+    add_run(parser, episodes=1)
+    parser.add_argument("--record", type=Path, metavar="FILE", help="write a video (.mp4 or .gif) instead of a window")
+    parser.add_argument(
+        "--fps", type=int, default=25, help="frames a second; the video skips steps to play in real time (default: 25)"
     )
-    if args.episodes < 1 or args.fps < 1:
-        parser.error("--episodes and --fps must be at least 1")
-    if args.record is None and not has_display:
-        parser.error("there is no display here to open a window on: give --record FILE.mp4")
-    if args.record is not None and args.record.suffix not in (".mp4", ".gif"):
-        parser.error(f"--record takes a file ending in .mp4 or .gif, got {args.record}")
-    if not has_display:
+    parser.add_argument("--answer", choices=ANSWERS, help="who acts in a SAID agent (default: the agent)")
+    args = parser.parse_args(argv)
+    is_linux, displays = sys.platform.startswith("linux"), ("DISPLAY", "WAYLAND_DISPLAY")
+    if is_linux and not any(os.environ.get(name) for name in displays):
+        if args.record is None:
+            parser.error("there is no display here to open a window on: give --record FILE.mp4")
         os.environ.setdefault("MUJOCO_GL", "egl")
-    try:
+    with explained(parser):
+        check_positive(args, "episodes", "fps")
         if args.record is not None:
-            check_can_record()
-        render_mode = "human" if args.record is None else "rgb_array"
-        run = load_run(args.run, args.algo, args.env, read_delay(args.delay), args.device, {"render_mode": render_mode})
-        context = answering(run.model, args.answer)
-    except ValueError as error:
-        parser.error(str(error))
-    except (CannotDraw, ModuleNotFoundError) as error:
-        parser.exit(1, f"{error}\n")
-
-    video = None if args.record is None else Video(args.record, args.fps)
-    try:
-        with context:
-            rollout(
-                run.model,
-                run.make_env,
-                args.episodes,
-                args.seed,
-                deterministic=not args.stochastic,
-                normalize=run.normalize,
-                on_step=None if video is None else video.on_step,
-                on_episode=lambda i, ret, length: print(f"seed {args.seed + i}: return {ret:,.1f} in {length} steps"),
-            )
-    except CannotDraw as error:
-        parser.exit(1, f"{error}\n")
-    finally:
-        if video is not None:
-            video.close()
+            check_can_record(args.record)
+        drawn = {"render_mode": "human" if args.record is None else "rgb_array"}
+        run = load_run(args.run, args.algo, args.env, read_delay(args.delay), args.device, drawn)
+        video = None if args.record is None else Video(args.record, args.fps)
+        try:
+            with answering(run.model, args.answer):
+                run.play(
+                    args.episodes,
+                    args.seed,
+                    deterministic=not args.stochastic,
+                    on_step=None if video is None else video.on_step,
+                    on_episode=lambda i, ret, n: print(f"seed {args.seed + i}: return {ret:,.1f} in {n} steps"),
+                )
+        finally:
+            if video is not None:
+                video.close()
     if video is not None:
         print(f"Wrote {args.record}: {video.frames} frames at {video.fps:g} a second")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -10,24 +9,24 @@ from typing import Any
 import torch as th
 from tqdm import tqdm
 
-from sb3_said.evaluation import Summary, collect_observations, measure_latency, plots, rollout
+from sb3_said.evaluation import Summary, collect_observations, measure_latency, plots
 from sb3_said.files.atomic import write_json
-from sb3_said.zoo.manager import add_delay, read_delay
+from sb3_said.zoo.arguments import add_run, check_positive, explained, make_parser, read_delay
 from sb3_said.zoo.runs import LoadedRun, answering, answers, load_run, origin
 
 EPILOG = """\
 examples:
   # 20 episodes of the planner, and of the expert beside it; writes evaluation.json into the run folder
-  python scripts/evaluate.py logs/said/Hopper-v5-delay4_1
+  sb3-said evaluate logs/said/Hopper-v5-delay4_1
 
   # the checkpoint that did best in training, with a plot
-  python scripts/evaluate.py logs/said/Hopper-v5-delay4_1/best_model.zip --plot hopper.png
+  sb3-said evaluate logs/said/Hopper-v5-delay4_1/best_model.zip --plot hopper.png
 
   # the same agent under a shorter delay than it was built for
-  python scripts/evaluate.py logs/said/Hopper-v5-delay4_1 --delay 2 --json hopper_d2.json
+  sb3-said evaluate logs/said/Hopper-v5-delay4_1 --delay 2 --json hopper_d2.json
 
   # an agent that came without its run folder
-  python scripts/evaluate.py hopper.zip --algo said --env Hopper-v5 --delay 4
+  sb3-said evaluate hopper.zip --algo said --env Hopper-v5 --delay 4
 
 Episode i starts from reset seed --seed + i, so that two agents meet the same starts, and --n-envs changes only the
 speed. Returns are undiscounted sums of the task's own rewards. Decision latency is measured apart from the episodes,
@@ -36,60 +35,35 @@ A run folder's YAML can run code (rl_zoo3 reads it so): open only folders that y
 """
 
 
-def make_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("run", metavar="RUN_OR_ZIP", help="run folder of a training, or an agent's .zip")
-    parser.add_argument("--episodes", type=int, default=20, help="whole episodes for each answer (default: 20)")
-    parser.add_argument("--seed", type=int, default=10_000, help="reset seed of the first episode (default: 10000)")
+def main(argv: list[str] | None = None) -> None:
+    parser = make_parser(__doc__, EPILOG)
+    add_run(parser, episodes=20)
     parser.add_argument("--n-envs", type=int, default=8, help="episodes played side by side (default: 8)")
-    parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the best")
-    parser.add_argument("--algo", help="algorithm of a .zip without its run folder")
-    parser.add_argument("--env", help="task to play (default: the trained one)")
-    add_delay(parser, default="the trained one")
     parser.add_argument("--latency-calls", type=int, default=200, help="decisions to time, 0 for none (default: 200)")
     parser.add_argument("--json", type=Path, help="where to write the numbers (default: RUN/evaluation.json)")
     parser.add_argument(
         "--plot", type=Path, help="draw returns, and the training curves there are, to this .png or .pdf"
     )
-    parser.add_argument("--device", default="auto", help="torch device (default: auto)")
     parser.add_argument("--num-threads", type=int, help="torch threads (default: torch's own choice)")
-    return parser
-
-
-def main(argv: list[str] | None = None) -> None:
-    parser = make_parser()
     args = parser.parse_args(argv)
-    if args.episodes < 1 or args.n_envs < 1 or args.latency_calls < 0:
-        parser.error("--episodes and --n-envs must be at least 1, --latency-calls at least 0")
     if args.num_threads is not None:
         th.set_num_threads(args.num_threads)
-    try:
+    with explained(parser):
+        check_positive(args, "episodes", "n_envs")
         if args.plot is not None:
             plots.panels()  # without matplotlib, fail now and not after the episodes
         run = load_run(args.run, args.algo, args.env, read_delay(args.delay), args.device)
-    except ValueError as error:
-        parser.error(str(error))
-    except ImportError as error:
-        parser.exit(1, f"{error}\n")
 
     last_seed = args.seed + args.episodes - 1
     print(f"{run.info['algo']} on {run.info['env']}, delay {run.info['delay']}, reset seeds {args.seed}..{last_seed}")
+    settings = {"seed": args.seed, "n_envs": args.n_envs, "deterministic": not args.stochastic}
     who: list[str | None] = [*answers(run.model)] or [None]
-    summaries = [evaluate(run, answer, args) for answer in who]
+    summaries = [evaluate(run, answer, args.episodes, latency_calls=args.latency_calls, **settings) for answer in who]
     print_table(summaries)
 
+    document = {**run.info, "n_episodes": args.episodes, **settings}
+    document |= {"results": [summary.to_dict() for summary in summaries], "origin": origin(run)}
     target = args.json or run.folder / "evaluation.json"
-    settings = {
-        "n_episodes": args.episodes, "seed": args.seed, "n_envs": args.n_envs, "deterministic": not args.stochastic
-    }  # fmt: skip
-    document = {
-        **run.info,
-        **settings,
-        "results": [summary.to_dict() for summary in summaries],
-        "origin": origin(run),
-    }
     write_json(target, document)
     print(f"Wrote {target}")
     if args.plot is not None:
@@ -97,25 +71,23 @@ def main(argv: list[str] | None = None) -> None:
         print(f"Wrote {args.plot}")
 
 
-def evaluate(run: LoadedRun, answer: str | None, args: argparse.Namespace) -> Summary:
+def evaluate(
+    run: LoadedRun,
+    answer: str | None,
+    n_episodes: int,
+    seed: int,
+    n_envs: int = 8,
+    deterministic: bool = True,
+    latency_calls: int = 200,
+) -> Summary:
     """Play the episodes and time the decisions of one answer."""
     label = answer or run.info["algo"]
-    deterministic = not args.stochastic
-    with answering(run.model, answer), tqdm(total=args.episodes, desc=label, unit="episode", leave=False) as bar:
-        played = rollout(
-            run.model,
-            run.make_env,
-            args.episodes,
-            args.seed,
-            args.n_envs,
-            deterministic,
-            run.normalize,
-            on_episode=lambda *_: bar.update(),
-        )
+    with answering(run.model, answer), tqdm(total=n_episodes, desc=label, unit="episode", leave=False) as bar:
+        played = run.play(n_episodes, seed, n_envs, deterministic=deterministic, on_episode=lambda *_: bar.update())
         latency = None
-        if args.latency_calls:
-            observations = collect_observations(run.make_env, min(args.latency_calls, 100), args.seed)
-            latency = measure_latency(run.model, observations, args.latency_calls, deterministic, run.normalize)
+        if latency_calls > 0:
+            observations = collect_observations(run.make_env, min(latency_calls, 100), seed)
+            latency = measure_latency(run.model, observations, latency_calls, deterministic, run.normalize)
     return Summary.from_episodes(label, played.returns, played.lengths, latency)
 
 

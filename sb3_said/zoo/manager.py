@@ -1,4 +1,4 @@
-"""What the command lines share: our algorithms and delays inside rl_zoo3's ``ExperimentManager``."""
+"""Our algorithms, delays and resumable runs inside rl_zoo3's ``ExperimentManager``."""
 
 from __future__ import annotations
 
@@ -7,14 +7,10 @@ import functools
 import json
 import os
 import re
-import sys
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch as th
-import yaml
 from rl_zoo3 import ALGOS
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
@@ -25,14 +21,12 @@ from stable_baselines3.common.logger import Logger, make_output_format
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC, PlannerTrainingCallback
-from sb3_said.delays.text import age_range, make_process
+from sb3_said.delays.text import make_process
 from sb3_said.files.atomic import write_json
 from sb3_said.files.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback, restore_training
+from sb3_said.zoo.arguments import Delay, largest_delay
+from sb3_said.zoo.presets import config_file, preset_overrides
 
-#: A delay as YAML has it: control steps, [low, high], or a process as text; None for a task without the wrapper.
-Delay = int | list[int] | str | None
-
-CONFIGS = Path(__file__).resolve().parents[2] / "zoo_configs"
 ARGUMENTS_NAME = "train_args.json"
 WRAPPER = "sb3_said.delays.DelayedObservationWrapper"
 
@@ -48,84 +42,6 @@ for _name, (_class, _) in ALGORITHMS.items():
     ALGOS[_name] = _class
     HYPERPARAMS_SAMPLER[_name] = HYPERPARAMS_SAMPLER["sac"]
     HYPERPARAMS_CONVERTER[_name] = HYPERPARAMS_CONVERTER["sac"]
-
-PRESETS = ("cpu", "paper", "smoke", "quick")
-
-
-def config_file(algo: str) -> Path:
-    """Return the YAML file of an algorithm; SAC, SA, DR and SADR share one."""
-    return CONFIGS / ("said.yml" if algo == "said" else "delayed_sac.yml")
-
-
-def default_preset() -> str:
-    """Return ``paper`` where there is a GPU to run it on, ``cpu`` elsewhere."""
-    return "paper" if th.cuda.is_available() else "cpu"
-
-
-DELAY_HELP = (
-    "age of observations in control steps; LOW HIGH: drawn anew each episode; or a process of docs/delays.md, such as "
-    "'DroppedPackets(4, p=0.1)'"
-)
-
-
-def add_delay(parser: argparse.ArgumentParser, default: str, name: str = "--delay", help: str = DELAY_HELP) -> None:
-    """Give a command line an option of a delay, to be read by ``read_delay``.
-
-    :param default: what leaving it out means
-    """
-    parser.add_argument(name, nargs="+", default=[], metavar="STEPS", help=f"{help} (default: {default})")
-
-
-def read_delay(words: list[str]) -> Delay:
-    """Return what was given to ``--delay`` in the form that YAML and the wrapper take.
-
-    :raises ValueError: for anything but N, LOW HIGH or one process
-    """
-    if not words:
-        return None
-    numbers = [int(word) for word in words if word.removeprefix("-").isdigit()]
-    if len(words) > 2 or len(numbers) not in (0, len(words)) or (not numbers and len(words) > 1):
-        raise ValueError(f"--delay takes N, or LOW HIGH, or one process in quotes, got {' '.join(words)}.")
-    delay: int | list[int] | str = words[0] if not numbers else numbers[0] if len(numbers) == 1 else numbers
-    make_process(delay)
-    return delay
-
-
-def largest_delay(delay: Delay) -> int:
-    """Return the largest age that a delay can bring, 0 without one."""
-    return 0 if delay is None else make_process(delay).max_delay
-
-
-def is_always(delay: Delay, age: int) -> bool:
-    """Say whether a delay makes all observations amid an episode as old as this."""
-    return age_range(0 if delay is None else delay) == (age, age)
-
-
-def preset_overrides(
-    config: str | Path, preset: str, env_id: str, delay: Delay, max_delay: int | None = None
-) -> dict[str, Any]:
-    """Return what a preset changes for a task: its own entry of ``presets:`` in the file, or the preset's default.
-
-    ``cpu`` is what the file says outside ``presets:``, so that rl_zoo3 alone reads it too.
-
-    :param delay: ``planner_by_delay`` is looked up by the largest it can be
-    :param max_delay: length of the action history, the largest of ``delay`` by default; where observations can be
-        younger, a preset's planner of this one delay (``mask: fixed``) becomes one of all delays
-    :raises ValueError: for a preset the file does not have
-    """
-    if preset == "cpu":
-        return {}
-    presets = (yaml.safe_load(Path(config).read_text()) or {}).get("presets", {})
-    if preset not in presets:
-        raise ValueError(f"{config} has no preset '{preset}', only {['cpu', *presets]}.")
-    overrides = dict(presets[preset].get(env_id, presets[preset]["default"]))
-    tuned = overrides.pop("planner_by_delay", {}).get(largest_delay(delay))
-    if tuned is not None:
-        overrides["planner_kwargs"] = {**overrides["planner_kwargs"], "depth": tuned[0], "temperature": tuned[1]}
-    max_delay = largest_delay(delay) if max_delay is None else max_delay
-    if not is_always(delay, max_delay) and overrides.get("planner_kwargs", {}).get("mask") == "fixed":
-        overrides["planner_kwargs"] = {**overrides["planner_kwargs"], "mask": "random"}
-    return overrides
 
 
 @dataclass(frozen=True)
@@ -173,9 +89,8 @@ class DelayedExperimentManager(ExperimentManager):
         self.run = run
         name = f"{self.env_name}{run.delay_name}"
         run_id = get_latest_run_id(self.log_path, name) + 1
-        self.save_path = str(run.resume or Path(self.log_path) / f"{name}_{run_id}")
-        if zoo_kwargs.get("uuid_str") and run.resume is None:
-            self.save_path += zoo_kwargs["uuid_str"]
+        new_path = str(Path(self.log_path) / f"{name}_{run_id}") + zoo_kwargs.get("uuid_str", "")
+        self.save_path = new_path if run.resume is None else str(run.resume)
         self.params_path = f"{self.save_path}/{self.env_name}"
 
         overrides = preset_overrides(self.config, run.preset, env_id, run.delay, run.max_delay)
@@ -186,19 +101,6 @@ class DelayedExperimentManager(ExperimentManager):
         if run.expert_delay is not None and "env_wrapper" in (self.custom_hyperparams or {}):
             raise ValueError("--expert-delay sets the wrapper itself; leave env_wrapper out of -params.")
         self.custom_hyperparams = {**overrides, **(self.custom_hyperparams or {})}
-        planner_kwargs = self.custom_hyperparams.get("planner_kwargs")
-        is_fixed = isinstance(planner_kwargs, dict) and planner_kwargs.get("mask") == "fixed"
-        if is_fixed and not is_always(run.delay, run.max_delay):
-            raise ValueError(
-                f"A planner with mask='fixed' serves the largest delay alone, here {run.max_delay}, got --delay "
-                f"{run.delay}; leave mask out of -params."
-            )
-
-    def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
-        with warnings.catch_warnings():
-            if self.run.expert_delay is not None:  # the planner is not for the environment that the expert learns in
-                warnings.filterwarnings("ignore", "A planner with mask='fixed'", UserWarning)
-            return super().setup_experiment()
 
     def create_envs(self, *args: Any, **kwargs: Any) -> VecEnv:
         """Make environments of the expert's delay, in training as in the evaluations beside it.
@@ -218,10 +120,8 @@ class DelayedExperimentManager(ExperimentManager):
     def create_log_folder(self) -> None:
         super().create_log_folder()
         self.monitor_kwargs["override_existing"] = not self.checkpoint.exists()
-        # What was not given and may be another on a resume: the seed is drawn, the preset depends on the machine.
-        chosen = {"--preset": self.run.preset, "--seed": str(self.seed)}
-        words = [word for name, value in chosen.items() if name not in self.run.argv for word in (name, value)]
-        write_arguments(Path(self.save_path), [*self.run.argv, *words])
+        drawn = [] if "--seed" in self.run.argv else ["--seed", str(self.seed)]
+        write_json(Path(self.save_path) / ARGUMENTS_NAME, [*self.run.argv, *drawn])
 
     def create_callbacks(self) -> None:
         super().create_callbacks()
@@ -273,7 +173,7 @@ def log_suffix(folder: Path, steps: int) -> str:
     """Return what follows ``progress`` in the name of a log that starts now, so that no earlier one is overwritten.
 
     :param folder: of the run
-    :param steps: environment steps the run has taken
+    :param steps: that the run has taken
     """
     names = ["" if steps == 0 else f"_{steps}", *(f"_{steps}_{k}" for k in range(2, 1000))]
     return next(name for name in names if not (folder / f"progress{name}.csv").exists())
@@ -297,11 +197,6 @@ def drop_undone_episodes(run_dir: Path, steps: int) -> None:
         os.truncate(file, size)  # in place: the environments have opened it, to append to it
 
 
-def write_arguments(run_dir: Path, argv: list[str]) -> None:
-    """Keep the command line of a run for ``read_arguments``."""
-    write_json(run_dir / ARGUMENTS_NAME, argv)
-
-
 def read_arguments(run_dir: Path) -> list[str]:
     """Return the command line that a run was started with.
 
@@ -309,5 +204,7 @@ def read_arguments(run_dir: Path) -> list[str]:
     """
     path = run_dir / ARGUMENTS_NAME
     if not path.exists():
-        sys.exit(f"{run_dir} holds no run: {path} is missing. Give the folder that train.py printed as 'Log path'.")
+        raise ValueError(
+            f"{run_dir} holds no run: {path} is missing. Give the folder that the training printed as 'Log path'."
+        )
     return list(json.loads(path.read_text()))

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from datetime import datetime, timezone
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, get_args
 
@@ -22,12 +22,13 @@ from rl_zoo3.utils import get_saved_hyperparams, get_wrapper_class
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_said import DelayedSAC
+from sb3_said import DelayedSAC, __version__
 from sb3_said.delays import DelayProcess, FixedDelay
 from sb3_said.delays.space import ages_of, has_state_history
-from sb3_said.evaluation.rollout import Observation
+from sb3_said.evaluation.rollout import Observation, Rollout, rollout
 from sb3_said.said.policies import Answer
-from sb3_said.zoo.manager import ALGOS, WRAPPER, Delay, largest_delay
+from sb3_said.zoo.arguments import Delay, largest_delay
+from sb3_said.zoo.manager import ALGOS, WRAPPER
 
 ANSWERS = get_args(Answer)
 
@@ -45,6 +46,10 @@ class LoadedRun:
     """of the run, for results"""
     info: dict[str, Any]
     """what was loaded, in JSON types: algo, env, delay, file, trained_steps"""
+
+    def play(self, n_episodes: int, seed: int, n_envs: int = 1, **kwargs: Any) -> Rollout:
+        """Play whole episodes, see :func:`~sb3_said.evaluation.rollout`."""
+        return rollout(self.model, self.make_env, n_episodes, seed, n_envs, normalize=self.normalize, **kwargs)
 
 
 def load_run(
@@ -70,9 +75,9 @@ def load_run(
     :raises ValueError: when the files do not say what to load, or the agent does not fit the task
     """
     file, params = _find(Path(path))
-    hyperparams, args = _read_params(params)
+    hyperparams, args = read_params(params)
     algo = algo or args.get("algo")
-    env_id = env_id or getattr(args.get("env"), "gym_id", args.get("env"))
+    env_id = env_id or args.get("env")
     if algo not in ALGOS:
         raise ValueError(f"The algorithm of {file} is not known ({algo}): give --algo, one of {', '.join(ALGOS)}.")
     if env_id is None:
@@ -99,13 +104,8 @@ def load_run(
     if isinstance(model, DelayedSAC):
         model.check_ages(ages_of(env))
     env.close()
-    info = {
-        "algo": algo,
-        "env": env_id,
-        "delay": delay_name(delay_process),
-        "file": str(file),
-        "trained_steps": model.num_timesteps,
-    }
+    info = {"algo": algo, "env": env_id, "delay": delay_name(delay_process)}
+    info |= {"file": str(file), "trained_steps": model.num_timesteps}
     return LoadedRun(model, make_env, _load_normalize(params, hyperparams, make_env), file.parent, info)
 
 
@@ -128,11 +128,8 @@ def answering(model: BaseAlgorithm, answer: str | None) -> AbstractContextManage
     """
     if answer is None:
         return nullcontext()
-    if answer not in answers(model):
-        raise ValueError(
-            f"This {type(model).__name__} cannot answer as {answer!r}: only a SAID agent has an expert, "
-            "and a planner once that is trained."
-        )
+    if not hasattr(model.policy, "answering"):
+        raise ValueError(f"This {type(model).__name__} cannot answer as {answer!r}: only a SAID agent has an expert.")
     context: AbstractContextManager[Any] = model.policy.answering(answer)  # type: ignore[operator]
     return context
 
@@ -147,23 +144,16 @@ def longest_delay(model: BaseAlgorithm) -> int | None:
 
 def origin(run: LoadedRun) -> dict[str, Any]:
     """Say what a reader needs to judge and repeat the numbers: command, date, machine, versions."""
-    packages = ("sb3_said", "stable_baselines3", "torch", "gymnasium", "mujoco", "numpy")
+    program = sys.argv[0] if sys.argv[0].startswith("sb3-said ") else f"python {sys.argv[0]}"
+    packages = ("stable_baselines3", "torch", "gymnasium", "mujoco", "numpy")
     return {
-        "command": shlex.join(["python", *sys.argv]),
+        "command": f"{program} {shlex.join(sys.argv[1:])}",
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} CPU cores",
         "device": str(run.model.device),
         "torch_threads": th.get_num_threads(),
-        "versions": {"python": platform.python_version(), **{package: version_of(package) for package in packages}},
+        "versions": {"python": platform.python_version(), "sb3_said": __version__, **{p: version(p) for p in packages}},
     }
-
-
-def version_of(package: str) -> str:
-    """Return the installed version; a clone can run without being installed."""
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "not installed"
 
 
 def _find(path: Path) -> tuple[Path, Path | None]:
@@ -185,14 +175,18 @@ def _find(path: Path) -> tuple[Path, Path | None]:
     raise ValueError(f"{path} has no finished agent: neither {candidates[0].name} nor {candidates[1].name}.")
 
 
-def _read_params(params: Path | None) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return a run's hyper-parameters and command-line arguments; empty without a run folder."""
+def read_params(params: Path | None) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return a run's hyper-parameters and command-line arguments from the folder of its YAML; empty without one.
+
+    The YAML can run code: read only that of runs that you trust.
+    """
     if params is None:
         return {}, {}
     hyperparams, _ = get_saved_hyperparams(str(params), test_mode=True)
     # rl_zoo3 writes Python objects into this file, so that no safe loader reads it.
-    args = yaml.load((params / "args.yml").read_text(), Loader=yaml.UnsafeLoader)
-    return dict(hyperparams), dict(args)
+    args = dict(yaml.load((params / "args.yml").read_text(), Loader=yaml.UnsafeLoader))
+    args["env"] = getattr(args.get("env"), "gym_id", args.get("env"))
+    return dict(hyperparams), args
 
 
 def _with_delay(wrappers: list[Any], delay: Delay, model: BaseAlgorithm) -> list[Any]:
@@ -200,24 +194,20 @@ def _with_delay(wrappers: list[Any], delay: Delay, model: BaseAlgorithm) -> list
     max_delay = longest_delay(model)
     if max_delay is None:
         if largest_delay(delay) > 0:
-            raise ValueError(
-                f"This agent reads {model.observation_space}, not delayed observations: "
-                f"it cannot play with --delay {delay}."
-            )
+            space = model.observation_space
+            raise ValueError(f"This agent reads {space}, not delayed observations: leave out --delay {delay}.")
         return wrappers
     if largest_delay(delay) > max_delay:
         raise ValueError(f"This agent was built for delays 0..{max_delay}, got --delay {delay}.")
     kwargs: dict[str, Any] = {"delay": max_delay if delay is None else delay, "max_delay": max_delay}
     if has_state_history(model.observation_space):
         kwargs["state_history"] = True
-    names = [next(iter(w)) if isinstance(w, dict) else w for w in wrappers]
-    delayed = [str(name).endswith(WRAPPER.rsplit(".", 1)[1]) for name in names]
-    if not any(delayed):
+    name = WRAPPER.rsplit(".", 1)[1]
+    is_delay = [name in str(wrapper) for wrapper in wrappers]
+    if not any(is_delay):
         return [*wrappers, {WRAPPER: kwargs}]
-    return [
-        {name: {**(w[name] if isinstance(w, dict) else {}), **kwargs}} if is_delay else w
-        for w, name, is_delay in zip(wrappers, names, delayed, strict=True)
-    ]
+    old = [next(iter(w.values())) if isinstance(w, dict) else {} for w in wrappers]
+    return [{WRAPPER: {**o, **kwargs}} if d else w for w, o, d in zip(wrappers, old, is_delay, strict=True)]
 
 
 def _check_spaces(model: BaseAlgorithm, env: gym.Env[Any, Any], file: Path) -> None:

@@ -9,36 +9,27 @@ from typing import Any
 
 import rl_zoo3.train
 
-from sb3_said.zoo.manager import (
-    ALGORITHMS,
-    PRESETS,
-    DelayedExperimentManager,
-    Run,
-    add_delay,
-    default_preset,
-    read_arguments,
-    read_delay,
-)
+from sb3_said.zoo.arguments import add_delay, explained, make_parser, read_delay
+from sb3_said.zoo.manager import ALGORITHMS, DelayedExperimentManager, Run, read_arguments
+from sb3_said.zoo.presets import PRESETS
 
 EXAMPLES = """
 examples:
-  python scripts/train.py --algo said --env Hopper-v5 --delay 4
-  python scripts/train.py --algo said --env Ant-v5 --delay 8 --preset paper --seed 1
-  python scripts/train.py --algo sadr --env HalfCheetah-v5 --delay 0 8 -n 300000 -P
-  python scripts/train.py --algo said --env Hopper-v5 --delay "DroppedPackets(UniformDelay(0, 8), p=0.1)"
-  python scripts/train.py --algo said --env Hopper-v5 --delay 0 16 --expert-delay 0
-  python scripts/train.py --resume logs/said/Hopper-v5-delay4_1
+  sb3-said train --algo said --env Hopper-v5 --delay 4
+  sb3-said train --algo said --env Ant-v5 --delay 8 --preset paper --seed 1
+  sb3-said train --algo sadr --env HalfCheetah-v5 --delay 0 8 -n 300000 -P
+  sb3-said train --algo said --env Hopper-v5 --delay "DroppedPackets(UniformDelay(0, 8), p=0.1)"
+  sb3-said train --algo said --env Hopper-v5 --delay 0 16 --expert-delay 0
+  sb3-said train --resume logs/said/Hopper-v5-delay4_1
 
-Runs go to LOG_FOLDER/ALGO/ENV-delayN_K (-f sets LOG_FOLDER); scripts/evaluate.py and scripts/enjoy.py take that folder.
+Runs go to LOG_FOLDER/ALGO/ENV-delayN_K (-f sets LOG_FOLDER); sb3-said evaluate and sb3-said enjoy take that folder.
 Below: the options of rl_zoo3, all of which work here.
 """
 
 
-def parser() -> argparse.ArgumentParser:
+def own_parser() -> argparse.ArgumentParser:
     """Return the parser of the options that rl_zoo3 does not have."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter, add_help=False
-    )
+    parser = make_parser(__doc__, EXAMPLES, add_help=False)
     parser.add_argument("-h", "--help", action="store_true", help="show this help, then that of rl_zoo3")
     parser.add_argument("--algo", choices=list(ALGORITHMS), default="said", help="default: said")
     add_delay(parser, default="no delay")
@@ -48,16 +39,12 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--preset",
         choices=PRESETS,
-        default=default_preset(),
-        help="cpu: hours on two cores; paper: the paper's table, with a planner for every delay (mask='random') where "
-        "--delay varies; quick, smoke: minutes (default here: %(default)s)",
+        default="cpu",
+        help="cpu: hours on two cores; paper: the paper's table, 5 M steps and 1 M updates, with a planner for every "
+        "delay where --delay varies; quick, smoke: minutes (default: cpu)",
     )
     parser.add_argument(
-        "--checkpoint-freq",
-        type=int,
-        default=25_000,
-        metavar="STEPS",
-        help="steps between checkpoints (default: 25000)",
+        "--checkpoint-freq", type=int, default=25_000, metavar="N", help="steps between checkpoints (default: 25000)"
     )
     parser.add_argument("--resume", type=Path, metavar="RUN_DIR", help="go on with a run from its last checkpoint")
     return parser
@@ -65,32 +52,39 @@ def parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> None:
     """Train as the command line says."""
-    argv = sys.argv[1:] if argv is None else argv
-    options, zoo_argv = parser().parse_known_args(argv)
-    if options.help:
-        parser().print_help()
-    if options.resume is not None:
-        argv = [*read_arguments(options.resume), *without_resume(argv)]
-        resume, (options, zoo_argv) = options.resume, parser().parse_known_args(argv)
-        options.resume = resume
-    try:
-        delay, expert_delay = read_delay(options.delay), read_delay(options.expert_delay)
-    except ValueError as error:
-        parser().error(str(error))
-    if expert_delay is not None and (options.algo != "said" or delay is None):
-        parser().error("--expert-delay is for --algo said with a --delay: who has no planner acts as it has learned")
-    run = Run(argv, delay, options.preset, options.checkpoint_freq, options.resume, expert_delay)
+    parser = own_parser()
+    with explained(parser):
+        run, algo, zoo_argv = read_command_line(sys.argv[1:] if argv is None else argv)
+    if "--help" in zoo_argv:
+        parser.print_help()
 
     def make_manager(*args: Any, **kwargs: Any) -> DelayedExperimentManager:
-        try:
-            return DelayedExperimentManager(run, *args, **kwargs)
-        except ValueError as error:
-            parser().error(str(error))
+        with explained(parser):
+            manager = DelayedExperimentManager(run, *args, **kwargs)
+        return manager
 
     rl_zoo3.train.ExperimentManager = make_manager  # type: ignore[misc,assignment]
-    zoo_argv = joined_settings(zoo_argv)
-    sys.argv = [sys.argv[0], "--algo", options.algo, *zoo_argv, *(["--help"] if options.help else [])]
+    sys.argv = [sys.argv[0], "--algo", algo, *zoo_argv]
     rl_zoo3.train.train()
+
+
+def read_command_line(argv: list[str]) -> tuple[Run, str, list[str]]:
+    """Return what the command line adds to rl_zoo3's, the algorithm, and what is left for rl_zoo3.
+
+    :param argv: with ``--resume``, what changes in the command line that the run was started with
+    :raises ValueError: for a folder without a run, a delay that is none, or an expert's delay without a planner
+    """
+    resuming = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    resuming.add_argument("--resume", type=Path)
+    given, argv = resuming.parse_known_args(argv)
+    if given.resume is not None:
+        argv = [*read_arguments(given.resume), *argv]
+    options, zoo_argv = own_parser().parse_known_args(argv)
+    delay, expert_delay = read_delay(options.delay), read_delay(options.expert_delay)
+    if expert_delay is not None and (options.algo != "said" or delay is None):
+        raise ValueError("--expert-delay needs --algo said and a --delay: an agent without a planner is its expert.")
+    run = Run(argv, delay, options.preset, options.checkpoint_freq, given.resume, expert_delay)
+    return run, options.algo, [*joined_settings(zoo_argv), *(["--help"] if options.help else [])]
 
 
 def joined_settings(argv: list[str]) -> list[str]:
@@ -104,13 +98,3 @@ def joined_settings(argv: list[str]) -> list[str]:
         settings.add_argument(*names, dest=names[0], nargs="+", action="extend", default=[])
     given, rest = settings.parse_known_args(argv)
     return [*rest, *(word for name, words in vars(given).items() if words for word in (name, *words))]
-
-
-def without_resume(argv: list[str]) -> list[str]:
-    """Return a command line without ``--resume RUN_DIR``."""
-    kept, skip = [], False
-    for word in argv:
-        if not (skip or word == "--resume" or word.startswith("--resume=")):
-            kept.append(word)
-        skip = word == "--resume"
-    return kept

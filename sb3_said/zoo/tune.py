@@ -5,134 +5,100 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from argparse import Namespace
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import torch as th
+from filelock import FileLock
+from optuna import Study
 from optuna.trial import FrozenTrial
 
 from sb3_said import SAID
-from sb3_said.evaluation import bootstrap_interval, rollout
+from sb3_said.evaluation import bootstrap_interval
 from sb3_said.files.atomic import write_json
 from sb3_said.files.checkpoint import CHECKPOINT_NAME
+from sb3_said.zoo.arguments import check_positive, explained, make_parser
+from sb3_said.zoo.best import write_best
+from sb3_said.zoo.depths import DepthPlanners
 from sb3_said.zoo.evaluate import evaluate
-from sb3_said.zoo.locks import try_acquire, work_lock
 from sb3_said.zoo.runs import ANSWERS, LoadedRun, load_run, origin
-from sb3_said.zoo.study import Search, describe, returns_of, save_plots
-from sb3_said.zoo.tuning import DepthPlanners
-from sb3_said.zoo.winner import RunConfig
+from sb3_said.zoo.search import describe, find_winner, finished, open_study, returns_of, save_plot, search
 
 EPILOG = """\
 examples:
   # the paper's grid: three planners are trained, each is tried at six temperatures
-  python scripts/tune.py --run logs/said/Hopper-v5-delay4_1
+  sb3-said tune --run logs/said/Hopper-v5-delay4_1
 
   # the same with two workers, here or on machines that share the folder; run it again to go on after a crash
-  python scripts/tune.py --run logs/said/Hopper-v5-delay4_1 --num-threads 1 & \\
-  python scripts/tune.py --run logs/said/Hopper-v5-delay4_1 --num-threads 1
+  sb3-said tune --run logs/said/Hopper-v5-delay4_1 --num-threads 1 & \\
+  sb3-said tune --run logs/said/Hopper-v5-delay4_1 --num-threads 1
 
   # a quick look: one depth, fewer updates, fewer episodes, into a folder of its own
-  python scripts/tune.py --run logs/said/Hopper-v5-delay4_1 --depths 2 --gradient-steps 5000 --episodes 10 \\
-      --output look
+  sb3-said tune --run logs/said/Hopper-v5-delay4_1 --depths 2 --gradient-steps 5000 --episodes 10 --output look
 
-  # one denoising step is the mean of the likely plans: worse on one task, better and five times as fast on another
-  python scripts/tune.py --run logs/said/HalfCheetah-v5-delay0-16_1 --depths 2 --temperatures 0 --sampling-steps 1 2 5
+  # fewer denoising steps are faster, and on some tasks better
+  sb3-said tune --run logs/said/HalfCheetah-v5-delay0-16_1 --depths 2 --temperatures 0 --sampling-steps 1 2 5
 
   # any temperature from 0 to 1, in a data base
-  python scripts/tune.py --run logs/said/Hopper-v5-delay4_1 --sampler tpe --n-trials 30 --storage sqlite:///tune.db
+  sb3-said tune --run logs/said/Hopper-v5-delay4_1 --sampler tpe --n-trials 30 --storage sqlite:///tune.db
 
   # afterwards: train with the winner, or play it
-  python scripts/train.py --algo said --env Hopper-v5 --delay 4 -conf logs/said/Hopper-v5-delay4_1/tune/best.yml
-  python scripts/evaluate.py logs/said/Hopper-v5-delay4_1/tune/best.zip
+  sb3-said train --algo said --env Hopper-v5 --delay 4 -conf logs/said/Hopper-v5-delay4_1/tune/best.yml
+  sb3-said evaluate logs/said/Hopper-v5-delay4_1/tune/best.zip
 
-A run is what train.py --algo said left: its expert collects nothing more, its replay trains one planner per depth.
-Every trial plays the same episodes, --seed and up; one that is clearly worse than the best, episode by episode, is
-pruned. The winner, and the expert beside it, are reported on other episodes, --report-seed and up, since the best of
-many trials looks better on its own episodes than it is.
+A run is what sb3-said train --algo said left: its expert collects nothing more, its replay trains one planner per
+depth; then trials begin. Every trial plays the same episodes, --seed and up; one that is clearly worse than the best,
+episode by episode, is pruned. The winner, and the expert beside it, are reported on other episodes, --report-seed and
+up, since the best of many trials looks better on its own episodes than it is.
 
-Written to RUN_DIR/tune: planner_depthN.zip, study.log (the study), and by the worker that ends last results.json,
-best.yml, best.zip, importance.png and slice.png.
+Written to RUN_DIR/tune: planner_depthN.zip, study.log (the study), results.json, best.yml, best.zip and slice.png.
+Each worker reports when it ends; what the last one writes covers all trials.
 A run folder's YAML can run code (rl_zoo3 reads it so): open only folders that you trust.
 """
-
-
-def make_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--run", type=Path, required=True, metavar="RUN_DIR", help="folder that train.py left")
-    parser.add_argument("--depths", type=int, nargs="+", default=[2, 4, 8], metavar="N", help="default: 2 4 8")
-    parser.add_argument(
-        "--temperatures",
-        type=float,
-        nargs="+",
-        default=[0.0, 0.1, 0.3, 0.6, 0.8, 1.0],
-        metavar="T",
-        help="default: 0 0.1 0.3 0.6 0.8 1",
-    )
-    parser.add_argument(
-        "--sampling-steps", type=int, nargs="+", metavar="N", help="denoising steps (default: as the run's)"
-    )
-    parser.add_argument("--sampler", choices=("grid", "tpe"), default="grid", help="default: grid, every cell once")
-    parser.add_argument("--n-trials", type=int, help="trials of the whole study (default: as many as the grid has)")
-    parser.add_argument("--gradient-steps", type=int, help="updates of each planner (default: as the run's)")
-    parser.add_argument("--episodes", type=int, default=20, help="whole episodes of a trial (default: 20)")
-    parser.add_argument(
-        "--round", type=int, default=5, help="episodes side by side, between two looks at pruning (default: 5)"
-    )
-    parser.add_argument(
-        "--prune",
-        type=float,
-        default=0.05,
-        metavar="P",
-        help="p-value of the paired test below which a trial is pruned; 0: never (default: 0.05)",
-    )
-    parser.add_argument("--seed", type=int, default=20_000, help="reset seed of the first episode (default: 20000)")
-    parser.add_argument("--report-episodes", type=int, default=50, help="of the winner and the expert (default: 50)")
-    parser.add_argument(
-        "--report-seed", type=int, default=10_000, help="reset seed of the first of those (default: 10000)"
-    )
-    parser.add_argument(
-        "--storage", help="Optuna RDB URL, or path of a journal file (default: study.log in the output folder)"
-    )
-    parser.add_argument("--study-name", help="default: the run folder's name")
-    parser.add_argument("--output", type=Path, metavar="DIR", help="default: RUN_DIR/tune")
-    parser.add_argument("--timeout", type=float, metavar="SECONDS", help="begin no trial after this time")
-    parser.add_argument("--device", default="auto", help="torch device (default: auto)")
-    parser.add_argument("--num-threads", type=int, help="torch threads (default: torch's own choice)")
-    parser.add_argument("-P", "--progress", action="store_true", help="show a progress bar while a planner trains")
-    return parser
+DEPTHS, TEMPERATURES = [2, 4, 8], [0.0, 0.1, 0.3, 0.6, 0.8, 1.0]
 
 
 def main(argv: list[str] | None = None) -> None:
-    parser = make_parser()
+    parser = make_parser(__doc__, EPILOG)
+    add = parser.add_argument
+    add("--run", type=Path, required=True, metavar="RUN_DIR", help="folder that sb3-said train left")
+    add("--depths", type=int, nargs="+", default=DEPTHS, metavar="N", help="default: 2 4 8")
+    add("--temperatures", type=float, nargs="+", default=TEMPERATURES, metavar="T", help="default: 0 0.1 0.3 0.6 0.8 1")
+    add("--sampling-steps", type=int, nargs="+", metavar="N", help="denoising steps (default: as the run's)")
+    add("--sampler", choices=("grid", "tpe"), default="grid", help="default: grid, every cell once")
+    add("--n-trials", type=int, help="trials of the whole study (default: as many as the grid has)")
+    add("--gradient-steps", type=int, help="updates of each planner (default: as the run's)")
+    add("--episodes", type=int, default=20, help="whole episodes of a trial (default: 20)")
+    add("--round", type=int, default=5, help="episodes side by side, between two looks at pruning (default: 5)")
+    add("--prune", type=float, default=0.05, metavar="P", help="p-value of the paired test below which a trial is "
+        "pruned; 0: never (default: 0.05)")  # fmt: skip
+    add("--seed", type=int, default=20_000, help="reset seed of the first episode (default: 20000)")
+    add("--report-episodes", type=int, default=50, help="of the winner and the expert (default: 50)")
+    add("--report-seed", type=int, default=10_000, help="reset seed of the first of those (default: 10000)")
+    add("--storage", help="Optuna RDB URL, or path of a journal file (default: study.log in the output folder)")
+    add("--study-name", help="default: the run folder's name")
+    add("--output", type=Path, metavar="DIR", help="default: RUN_DIR/tune")
+    add("--timeout", type=float, metavar="SECONDS", help="begin no trial after this time")
+    add("--device", default="auto", help="torch device (default: auto)")
+    add("--num-threads", type=int, help="torch threads (default: torch's own choice)")
+    add("-P", "--progress", action="store_true", help="show a progress bar while a planner trains")
     args = parser.parse_args(argv)
     if args.num_threads is not None:
         th.set_num_threads(args.num_threads)
-    try:
+    with explained(parser):
         check(args)
         tune(args)
-    except ValueError as error:
-        parser.error(str(error))
-    except KeyboardInterrupt:
-        parser.exit(130, "\nInterrupted; the same command goes on.\n")
 
 
 def check(args: argparse.Namespace) -> None:
     """
     :raises ValueError: for options that make no search
     """
-    for name in ("episodes", "round", "report_episodes", "n_trials", "gradient_steps"):
-        value = getattr(args, name)
-        if value is not None and value < 1:
-            raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {value}.")
+    check_positive(args, "episodes", "round", "report_episodes", "n_trials", "gradient_steps")
     if not 0 <= args.prune < 1:
         raise ValueError(f"--prune is a p-value in [0, 1), got {args.prune}; 0 prunes nothing.")
-    if args.prune > 0 and find_spec("scipy") is None:
-        raise ValueError("Pruning needs SciPy: pip install scipy, or give --prune 0.")
     for name in ("depths", "temperatures", "sampling_steps"):
         values = getattr(args, name) or []
         if len(set(values)) < len(values):
@@ -147,63 +113,43 @@ def check(args: argparse.Namespace) -> None:
 
 
 def tune(args: argparse.Namespace) -> None:
-    """Search, and report unless another worker is still searching.
+    """Train the planners, make the trials and report.
 
     :raises ValueError: when the run cannot be tuned, or the output folder holds another search
     """
+    began = time.monotonic()
     run, model = open_run(args)
     folder = args.output or args.run / "tune"
     planners = DepthPlanners(model, args.run / CHECKPOINT_NAME, folder, args.gradient_steps, args.progress)
-    tried = {
-        "depth": args.depths,
-        "temperature": args.temperatures,
-        "sampling_steps": args.sampling_steps or [planners.config.sampling_steps],
-    }
+    steps = args.sampling_steps or [planners.config.sampling_steps]
+    tried = {"depth": args.depths, "temperature": args.temperatures, "sampling_steps": steps}
     for name, values in tried.items():
         for value in values:
-            replace(planners.config, **{name: value})
-    settings = {**planners.trial_settings(), "env": run.info["env"], "delay": run.info["delay"]}
-    search = Search(
-        folder,
-        args.storage or str(folder / "study.log"),
-        args.study_name or args.run.resolve().name,
-        tried,
-        args.sampler,
-        args.n_trials,
-        args.episodes,
-        args.round,
-        args.seed,
-        args.prune,
-        settings,
-    )
-    n_before = len(search.finished())
+            replace(planners.config, **{name: value})  # refuses what is no setting
+    common = {"sampler": args.sampler, "episodes": args.episodes, "seed": args.seed}
+    common |= {"env": run.info["env"], "delay": run.info["delay"]}
+    common |= {key: value for key, value in planners.settings(planners.config.depth).items() if key not in tried}
+    if args.sampler == "tpe":
+        common |= {**tried, "temperature": [min(args.temperatures), max(args.temperatures)]}
+    storage, name = args.storage or str(folder / "study.log"), args.study_name or args.run.resolve().name
+    study = open_study(folder, storage, name, common, args.prune)
     print(
-        f"{run.info['env']}, delay {run.info['delay']}: {n_before} trials are finished in {search.storage}", flush=True
+        f"{common['env']}, delay {common['delay']}: {len(finished(study))} trials are finished in {storage}", flush=True
     )
 
     def play(seed: int, n: int) -> list[float]:
-        played = rollout(model, run.make_env, n, seed, n, deterministic=True, normalize=run.normalize)
-        return [float(value) for value in played.returns]
+        return [float(value) for value in run.play(n, seed, n).returns]
 
-    made = search.work(planners, play, None if args.timeout is None else time.monotonic() + args.timeout)
-    if made == 0 and args.timeout is None:
-        print("No trial is left to make.")
-
-    others = search.running()
-    if others:
-        print(f"{len(others)} trials are still running in other workers; the last worker reports.")
-        return
-    winner = search.winner()
+    planners.train(args.depths)
+    left = None if args.timeout is None else max(args.timeout - (time.monotonic() - began), 0.0)
+    how = (args.sampler, args.n_trials, args.episodes, args.round, args.seed, left)
+    search(study, tried, planners.put, play, *how)
+    winner = find_winner(study)
     if winner is None:
         raise ValueError("No trial is finished, so there is no winner: give more --timeout or --n-trials.")
-    reporting = work_lock(folder / "locks" / "report.lock")
-    if not try_acquire(reporting):
-        print("Another worker reports.")
-        return
-    try:
-        report(args, run, search, planners, winner, folder)
-    finally:
-        reporting.release()
+    with FileLock(folder / "report.lock"):
+        planners.put(**winner.params)
+        report(args, run, study, winner, folder)
 
 
 def open_run(args: argparse.Namespace) -> tuple[LoadedRun, SAID]:
@@ -216,53 +162,34 @@ def open_run(args: argparse.Namespace) -> tuple[LoadedRun, SAID]:
         raise ValueError(f"{args.run} is a run of '{run.info['algo']}', which has no planner; give one of --algo said.")
     if not args.run.is_dir() or not (args.run / CHECKPOINT_NAME).is_file():
         raise ValueError(
-            f"{args.run} has no {CHECKPOINT_NAME}, whose replay the planners are trained on; give the folder that "
-            "train.py left, and finish the run if it was stopped: python scripts/train.py --resume RUN_DIR"
+            f"{args.run} has no {CHECKPOINT_NAME}, whose replay the planners are trained on; give the folder that the "
+            "training left, and finish the run if it was stopped: sb3-said train --resume RUN_DIR"
         )
     if run.normalize is not None:  # the bound method of the run's VecNormalize, which the replay needs too
         run.model._vec_normalize_env = run.normalize.__self__  # type: ignore[attr-defined]
     return run, run.model
 
 
-def report(
-    args: argparse.Namespace,
-    run: LoadedRun,
-    search: Search,
-    planners: DepthPlanners,
-    winner: FrozenTrial,
-    folder: Path,
-) -> None:
-    """Play the winner and the expert on fresh episodes and write everything that the search found."""
-    planners.put(**winner.params)
-    fresh = {
-        "study": search.name,
-        "trial": winner.number,
-        "finished": str(winner.datetime_complete),
-        "seed": args.report_seed,
-        "n_episodes": args.report_episodes,
-    }
+def report(args: argparse.Namespace, run: LoadedRun, study: Study, winner: FrozenTrial, folder: Path) -> None:
+    """Play the winner, which the agent has, and the expert on fresh episodes; write everything that was found."""
     results = folder / "results.json"
-    before = json.loads(results.read_text()).get("report", {}) if results.is_file() else {}
-    if {key: before.get(key) for key in fresh} == fresh and (folder / "best.zip").is_file():
+    fresh = {"study": study.study_name, "trial": winner.number, "finished": str(winner.datetime_complete)}
+    fresh |= {"seed": args.report_seed, "n_episodes": args.report_episodes}
+    before = json.loads(results.read_text())["report"] if results.is_file() else {}
+    if fresh.items() <= before.items():  # by another worker, or an earlier call
         played = before["results"]
     else:
-        how = Namespace(
-            episodes=args.report_episodes, seed=args.report_seed, n_envs=8, stochastic=False, latency_calls=100
-        )
-        played = [evaluate(run, answer, how).to_dict() for answer in ANSWERS]
-    assert isinstance(run.model, SAID)
+        how = (args.report_episodes, args.report_seed)
+        played = [evaluate(run, answer, *how, latency_calls=100).to_dict() for answer in ANSWERS]
     run.model.save(folder / "best.zip")
-    config = RunConfig.read(args.run)
+    trials = [trial_to_dict(trial, args.seed) for trial in finished(study)]
     choice = (
-        f"trial {winner.number} of {len(search.finished())} in study {search.name!r}, mean return "
-        f"{winner.value:.1f} over {search.episodes} episodes"
+        f"trial {winner.number} of {len(trials)} in study {study.study_name!r}, mean return {winner.value:.1f} over "
     )
-    left_out = config.write_best(folder, dict(winner.params), choice)
-
-    trials = [trial_to_dict(trial, args.seed) for trial in search.finished()]
+    command = write_best(args.run, folder, dict(winner.params), f"{choice}{args.episodes} episodes")
     document = {
         **run.info,
-        "settings": search.study.user_attrs["settings"],
+        "settings": study.user_attrs["settings"],
         "trials": trials,
         "winner": {**trial_to_dict(winner, args.seed), "agent": str(folder / "best.zip")},
         "report": {**fresh, "deterministic": True, "results": played},
@@ -278,15 +205,11 @@ def report(
         mean = one["mean_return"]
         interval = "" if mean["low"] is None else f"   95 % interval [{mean['low']:,.1f}, {mean['high']:,.1f}]"
         print(f"  {one['label']:8} {mean['value']:12,.1f}{interval}")
-    try:
-        plots = save_plots(search, folder)
-    except ImportError:
-        plots = []
-        print('No plots: they need matplotlib, pip install "sb3_said[plots]"')
-    for name in left_out:
-        print(f"Left out of best.yml, as YAML cannot hold it: {name}")
-    names = ["results.json", "best.yml", "best.zip", *(path.name for path in plots)]
-    print(f"Wrote {', '.join(names)} in {folder}\nTrain with it: {config.train_command(folder)}")
+    if find_spec("matplotlib") is None:
+        print('No plot: it needs matplotlib, pip install "sb3_said[plots]"')
+    else:
+        save_plot(study, folder / "slice.png")
+    print(f"Wrote results.json, best.yml and best.zip in {folder}\nTrain with it: {command}")
 
 
 def trial_to_dict(trial: FrozenTrial, seed: int) -> dict[str, Any]:

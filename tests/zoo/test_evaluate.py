@@ -150,7 +150,7 @@ def test_enjoy_prints_every_episode(run: Path, tmp_path: Path, capsys: pytest.Ca
     pytest.importorskip("imageio")
     # Drawing needs a GL library that a test machine may lack: a blank picture stands in for it.
     monkeypatch.setattr("gymnasium.envs.mujoco.MujocoEnv.render", lambda self: np.zeros((32, 32, 3), np.uint8))
-    monkeypatch.setattr(enjoy, "check_can_record", lambda: None)
+    monkeypatch.setattr(enjoy, "check_can_record", lambda path: None)
     film = tmp_path / "film.gif"
     enjoy.main([str(run), "--record", str(film), "--episodes", "2", "--answer", "expert", "--device", "cpu"])
     out = capsys.readouterr().out

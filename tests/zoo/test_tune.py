@@ -1,4 +1,4 @@
-"""tune.py: trains each depth once, resumes, shares its work between workers, prunes, and reports on fresh episodes."""
+"""sb3-said tune: from a run to a report on fresh episodes, alone and shared between workers."""
 
 from __future__ import annotations
 
@@ -16,18 +16,17 @@ import torch as th
 pytest.importorskip("rl_zoo3")
 pytest.importorskip("scipy")
 
-from trained_run import config_of, read_by_train, train_run, train_said
+from trained_run import ENV, config_of, read_by_train, train_run, train_said
 
 from sb3_said import SAID, PlannerConfig
-from sb3_said.evaluation import rollout
 from sb3_said.files.archive import load_tree
 from sb3_said.files.checkpoint import CHECKPOINT_NAME
 from sb3_said.zoo import tune
-from sb3_said.zoo.manager import read_delay
-from sb3_said.zoo.runs import load_run
-from sb3_said.zoo.winner import RunConfig
+from sb3_said.zoo.arguments import read_delay
+from sb3_said.zoo.best import plain_settings
+from sb3_said.zoo.runs import LoadedRun, load_run
 
-SCRIPT = Path(tune.__file__)
+SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "tune.py"
 QUICK = ["--episodes", "4", "--round", "2", "--report-episodes", "3", "--device", "cpu", "--num-threads", "1"]
 
 
@@ -42,60 +41,65 @@ def run(trained: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(trained, tmp_path / "run"))
 
 
-def forbidden(*_: Any, **__: Any) -> Any:
-    raise AssertionError("this was done already")
+def results_of(run: Path) -> dict[str, Any]:
+    return dict(json.loads((run / "tune" / "results.json").read_text()))
+
+
+def check_report(run: Path) -> None:
+    """The winner is the best trial, and best.zip gives the reported returns again."""
+    results, best = results_of(run), load_run(run / "tune" / "best.zip", device="cpu")
+    assert isinstance(best.model, SAID)
+    winner, report = results["winner"], results["report"]
+    complete = [trial for trial in results["trials"] if trial["state"] == "COMPLETE"]
+    assert winner["mean_return"] == max(trial["mean_return"] for trial in complete)
+    config = best.model.policy.planner.config
+    tried = ("depth", "temperature", "sampling_steps")
+    assert [getattr(config, name) for name in tried] == [winner[name] for name in tried]
+    assert [one["label"] for one in report["results"]] == ["planner", "expert"]
+    for one in report["results"]:
+        with best.model.policy.answering(one["label"]):
+            assert one["returns"] == best.play(report["n_episodes"], report["seed"], n_envs=8).returns.tolist()
 
 
 def test_a_search_from_grid_to_report(
     run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("matplotlib")
-    command = ["--run", str(run), "--depths", "1", "2", "--temperatures", "0", "1", "--sampling-steps", "2", *QUICK]
+    grid = ["--depths", "1", "2", "--temperatures", "0", "1", "--sampling-steps", "2", "--prune", "0"]
+    command = ["--run", str(run), *grid, *QUICK]
     seeds: list[int] = []
 
-    def recorded(model: Any, env: Any, n: int, seed: int, *args: Any, **kwargs: Any) -> Any:
+    def recorded(self: LoadedRun, n: int, seed: int, *args: Any, original: Any = LoadedRun.play, **kwargs: Any) -> Any:
         seeds.extend(range(seed, seed + n))
-        return rollout(model, env, n, seed, *args, **kwargs)
+        return original(self, n, seed, *args, **kwargs)
 
-    monkeypatch.setattr(tune, "rollout", recorded)
+    monkeypatch.setattr(LoadedRun, "play", recorded)
     tune.main(command)
     # Once for two temperatures, and never the depth that the run itself has.
     out = capsys.readouterr().out
     assert out.count("Training the planner of depth") == out.count("Training the planner of depth 2:") == 1
-    results = json.loads((run / "tune" / "results.json").read_text())
+    results = results_of(run)
     cells = {(trial["depth"], trial["temperature"]) for trial in results["trials"]}
     assert len(results["trials"]) == 4 and cells == {(1, 0.0), (1, 1.0), (2, 0.0), (2, 1.0)}
-    assert (run / "tune" / "importance.png").is_file() and (run / "tune" / "slice.png").is_file()
-
-    # The report is on other episodes, and evaluate.py gets the same numbers from best.zip.
-    report = results["report"]
-    assert set(seeds) == set(range(20_000, 20_004))
-    assert not set(seeds) & set(range(report["seed"], report["seed"] + report["n_episodes"]))
-    best = load_run(run / "tune" / "best.zip", device="cpu")
-    assert best.info["delay"] == 2 and isinstance(best.model, SAID)
-    winner = results["winner"]
-    config = best.model.policy.planner.config
-    assert (config.depth, config.temperature) == (winner["depth"], winner["temperature"])
-    assert config.sampling_steps == winner["sampling_steps"] == 2 != PlannerConfig().sampling_steps
-    for one in report["results"]:
-        with best.model.policy.answering(one["label"]):
-            played = rollout(best.model, best.make_env, 3, report["seed"], n_envs=8)
-        assert one["returns"] == played.returns.tolist()
-    assert [one["label"] for one in report["results"]] == ["planner", "expert"]
+    assert (run / "tune" / "slice.png").is_file()
+    # Every trial plays the same episodes, and the report is on others, once for the planner and once for the expert.
+    assert sorted(seeds) == sorted([*(4 * [*range(20_000, 20_004)]), *(2 * [*range(10_000, 10_003)])])
+    assert results["winner"]["sampling_steps"] == 2 != PlannerConfig().sampling_steps
+    check_report(run)
 
     # The same command again makes nothing twice, and still says what was found.
-    monkeypatch.setattr(tune, "rollout", forbidden)
-    monkeypatch.setattr(tune, "evaluate", forbidden)
+    seeds.clear()
     tune.main(command)
     out = capsys.readouterr().out
-    assert "No trial is left" in out and "4 trials" in out and "Training" not in out
-    assert json.loads((run / "tune" / "results.json").read_text())["report"] == report
+    assert not seeds and "No trial is left" in out and "4 trials" in out and "Training" not in out
+    assert results_of(run)["report"] == results["report"]
 
-    # A grid that grew makes only what is new.
-    monkeypatch.setattr(tune, "rollout", rollout)
-    tune.main(["--run", str(run), "--depths", "1", "--temperatures", "0", "0.5", "1", "--sampling-steps", "2", *QUICK])
-    trials = json.loads((run / "tune" / "results.json").read_text())["trials"]
-    assert [(t["depth"], t["temperature"]) for t in trials[4:]] == [(1, 0.5)]
+    # A training reads the winner.
+    best, winner = run / "tune" / "best.yml", results["winner"]
+    assert f"sb3-said train --algo said --env {ENV} --delay 2 -conf {best}" in out
+    expected = {**config_of(run), "n_timesteps": 200}
+    expected["planner_kwargs"] |= {name: winner[name] for name in ("depth", "temperature", "sampling_steps")}
+    assert read_by_train(best, 2, run) == expected
 
 
 @pytest.mark.parametrize(
@@ -107,11 +111,13 @@ def test_a_search_from_grid_to_report(
     ],
     ids=["drawn delay", "VecNormalize", "normalized rewards"],
 )
-def test_a_search_with_a_drawn_delay_or_vec_normalize(delay: list[int], params: list[str], tmp_path: Path) -> None:
+def test_a_search_with_a_drawn_delay_or_vec_normalize(
+    delay: list[int], params: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = train_said(tmp_path, *params, delay=delay)
     tune.main(["--run", str(run), "--depths", "1", "2", "--temperatures", "0.5", *QUICK])
-    results = json.loads((run / "tune" / "results.json").read_text())
-    assert [(trial["depth"], trial["temperature"]) for trial in results["trials"]] == [(1, 0.5), (2, 0.5)]
+    results = results_of(run)
+    assert sorted((trial["depth"], trial["temperature"]) for trial in results["trials"]) == [(1, 0.5), (2, 0.5)]
 
     # A depth is trained on the very data, in the very units, that the run's own planner was.
     own, other = (load_tree(run / "tune" / f"planner_depth{depth}.zip")["planner"] for depth in (1, 2))
@@ -121,24 +127,18 @@ def test_a_search_with_a_drawn_delay_or_vec_normalize(delay: list[int], params: 
         th.testing.assert_close(other[name], own[name], rtol=0, atol=0)
 
     # What is reported is what best.zip and its statistics give again, and best.yml is of the same task.
-    best, report = load_run(run / "tune" / "best.zip", device="cpu"), results["report"]
-    assert (best.normalize is not None) == bool(params)
-    for one in report["results"]:
-        with best.model.policy.answering(one["label"]):
-            played = rollout(best.model, best.make_env, 3, report["seed"], n_envs=8, normalize=best.normalize)
-        assert one["returns"] == played.returns.tolist()
+    assert (load_run(run / "tune" / "best.zip", device="cpu").normalize is not None) == bool(params)
+    check_report(run)
     expected = {**config_of(run), "n_timesteps": 200}
     tried = ("depth", "temperature", "sampling_steps")
     expected["planner_kwargs"] |= {name: results["winner"][name] for name in tried}
-    assert read_by_train(run / "tune" / "best.yml", read_delay([str(d) for d in delay]), "cpu", tmp_path) == expected
-    command = RunConfig.read(run).train_command(run / "tune")
-    assert f"--delay {' '.join(map(str, delay))} -conf" in command
+    assert read_by_train(run / "tune" / "best.yml", read_delay([str(d) for d in delay]), tmp_path) == expected
+    assert f"--delay {' '.join(map(str, delay))} -conf" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("storage", [[], ["--storage", "sqlite:///{}/study.db"]], ids=["journal", "sqlite"])
-def test_two_workers_share_a_study_and_train_no_depth_twice(run: Path, storage: list[str]) -> None:
+def test_two_workers_share_a_study_and_train_no_depth_twice(run: Path) -> None:
     grid = ["--depths", "2", "3", "--temperatures", "0", "1"]
-    command = [sys.executable, str(SCRIPT), "--run", str(run), *grid, *QUICK, *(word.format(run) for word in storage)]
+    command = [sys.executable, str(SCRIPT), "--run", str(run), *grid, *QUICK]
     environ = {**os.environ, "OMP_NUM_THREADS": "1"}
     workers = [
         subprocess.Popen(command, env=environ, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
@@ -148,9 +148,10 @@ def test_two_workers_share_a_study_and_train_no_depth_twice(run: Path, storage: 
     assert [worker.returncode for worker in workers] == [0, 0], outputs
     assert sum(out.count("Training the planner of depth 2") for out in outputs) == 1, outputs
     assert sum(out.count("Training the planner of depth 3") for out in outputs) == 1, outputs
-    trials = json.loads((run / "tune" / "results.json").read_text())["trials"]
-    assert len(trials) == 4 and len({(t["depth"], t["temperature"]) for t in trials}) == 4
-    assert (run / "study.db" if storage else run / "tune" / "study.log").exists()
+    trials = results_of(run)["trials"]
+    assert sorted((t["depth"], t["temperature"]) for t in trials) == [(2, 0.0), (2, 1.0), (3, 0.0), (3, 1.0)]
+    assert (run / "tune" / "study.log").exists()
+    check_report(run)
 
 
 @pytest.mark.parametrize(
@@ -164,6 +165,7 @@ def test_two_workers_share_a_study_and_train_no_depth_twice(run: Path, storage: 
         (["--sampling-steps", "0"], "sampling_steps is 0"),
         (["--sampling-steps", "2", "2"], "--sampling-steps names a value twice: 2 2"),
         (["--depths", "0"], "depth is 0"),
+        (["--depths", "1", "--timeout", "0"], "No trial is finished"),
     ],
 )
 def test_says_what_is_wrong(run: Path, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -184,3 +186,10 @@ def test_folders_that_cannot_be_tuned(run: Path, tmp_path: Path, capsys: pytest.
     with pytest.raises(SystemExit):
         tune.main(["--run", str(run), "--device", "cpu"])
     assert "has no checkpoint.zip" in capsys.readouterr().err
+
+
+def test_what_yaml_cannot_hold_is_named() -> None:
+    given = {"policy_kwargs": {"activation_fn": th.nn.Tanh}, "gamma": 0.9, "train_freq": (1, "step")}
+    block, left_out = plain_settings(given, {"env_kwargs": {"healthy_reward": 2.0}, "n_timesteps": -1})
+    assert block == {"gamma": 0.9, "train_freq": [1, "step"], "env_kwargs": {"healthy_reward": 2.0}}
+    assert left_out == ["policy_kwargs"]

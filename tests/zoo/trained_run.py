@@ -1,4 +1,4 @@
-"""Runs that train.py left, which here were hardly trained."""
+"""Runs that the command line left, which here were hardly trained."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from typing import Any
 import yaml
 
 from sb3_said.zoo import train
-from sb3_said.zoo.manager import Delay, DelayedExperimentManager, Run
+from sb3_said.zoo.arguments import Delay
+from sb3_said.zoo.manager import DelayedExperimentManager, Run
 
 ENV = "InvertedPendulum-v5"
 PLANNER = "dict(depth=1, d_model=32, horizon=4, sampling_steps=1, n_candidates=2, batch_size=8)"
@@ -18,7 +19,7 @@ PLANNER = "dict(depth=1, d_model=32, horizon=4, sampling_steps=1, n_candidates=2
 
 def train_run(folder: Path, algo: str, *params: str, delay: Sequence[int] = (2,)) -> Path:
     train.main(
-        ["--algo", algo, "--env", ENV, "--delay", *map(str, delay), "--preset", "cpu", "-f", str(folder), "--seed", "3",
+        ["--algo", algo, "--env", ENV, "--delay", *map(str, delay), "-f", str(folder), "--seed", "3",
          "--num-threads", "1", "--eval-freq", "-1", "--device", "cpu", "--verbose", "0", "-n", "200",
          "-params", "learning_starts:100", "buffer_size:400", *params]
     )  # fmt: skip
@@ -30,9 +31,9 @@ def train_said(folder: Path, *params: str, delay: Sequence[int] = (2,)) -> Path:
     return train_run(folder, "said", *planner, *params, delay=delay)
 
 
-def read_by_train(best: Path, delay: Delay, preset: str, folder: Path) -> dict[str, Any]:
-    """Return the hyper-parameters that train.py gets from a best.yml."""
-    run = Run([], delay, preset, 25_000)
+def read_by_train(best: Path, delay: Delay, folder: Path) -> dict[str, Any]:
+    """Return the hyper-parameters that a training gets from a best.yml."""
+    run = Run([], delay, "cpu", 25_000)
     manager = DelayedExperimentManager(run, Namespace(), "said", ENV, str(folder), config=str(best), verbose=0)
     return manager.read_hyperparameters()[0]
 

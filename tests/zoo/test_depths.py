@@ -6,14 +6,16 @@ import time
 from dataclasses import fields
 
 import pytest
+
+pytest.importorskip("rl_zoo3")
+
 import small_agent
 import torch as th
+from filelock import FileLock
 
-from sb3_said import SAID, PlannerConfig, PlannerTrainingCallback
+from sb3_said import SAID, PlannerConfig
 from sb3_said.files.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback
-from sb3_said.said import tuning
-from sb3_said.zoo.locks import is_held
-from sb3_said.zoo.tuning import DepthPlanners
+from sb3_said.zoo.depths import DepthPlanners
 
 STEPS = 3
 
@@ -28,23 +30,14 @@ def run(tmp_path_factory):
     return folder
 
 
-@pytest.fixture
-def trainings(monkeypatch):
-    """The depths that were trained, in order."""
-    depths, train = [], DepthPlanners._train
-
-    def counted(self, depth):
-        depths.append(depth)
-        train(self, depth)
-
-    monkeypatch.setattr(DepthPlanners, "_train", counted)
-    return depths
-
-
 def make(run, folder, steps=None, **settings):
     model = SAID.load(run / "agent.zip", device="cpu")
     model.set_planner(**settings)
     return DepthPlanners(model, run / CHECKPOINT_NAME, folder, steps)
+
+
+def config_of(planners):
+    return planners.model.policy.planner.config
 
 
 def same_planner(first, second):
@@ -53,41 +46,53 @@ def same_planner(first, second):
     )
 
 
-def test_each_depth_is_trained_once_and_never_the_runs_own(run, tmp_path, trainings):
+def trainings(capsys):
+    return capsys.readouterr().out.count("Training the planner of depth")
+
+
+def test_each_depth_is_trained_once_and_never_the_runs_own(run, tmp_path, capsys):
     planners = make(run, tmp_path)
+    planners.train([2, 1])
+    assert trainings(capsys) == 1
     for depth, temperature in ((1, 0.5), (2, 0.5), (1, 0.0), (2, 0.0)):
         planners.put(depth, temperature=temperature)
-        config = planners.model.policy.planner.config
-        assert (config.depth, config.temperature) == (depth, temperature)
-    assert trainings == [2]
-    make(run, tmp_path).put(2, temperature=0.5)
-    assert trainings == [2]
+        assert (config_of(planners).depth, config_of(planners).temperature) == (depth, temperature)
+    own = SAID.load(run / "agent.zip", device="cpu").policy.planner.state_dict()
+    planners.put(1)
+    th.testing.assert_close(planners.model.policy.planner.state_dict(), own, rtol=0, atol=0)
+    make(run, tmp_path).train([1, 2])
+    assert trainings(capsys) == 0
 
 
-def test_a_worker_waits_for_the_one_that_trains(run, tmp_path, trainings, capsys):
-    make(run, tmp_path / "ready").put(2, temperature=0.5)
+def test_a_worker_takes_a_free_depth_and_waits_for_the_one_that_another_trains(run, tmp_path, capsys):
+    make(run, tmp_path / "ready").train([2])
     planners = make(run, tmp_path / "shared")
+    (tmp_path / "shared").mkdir()
     began = threading.Event()
 
     def train_elsewhere():
-        with planners.lock(2):
+        with FileLock(tmp_path / "shared" / "planner_depth2.lock"):
             began.set()
-            time.sleep(0.5)
+            while not planners.path(3).exists():
+                time.sleep(0.01)
             (tmp_path / "ready" / "planner_depth2.zip").rename(planners.path(2))
 
-    threading.Thread(target=train_elsewhere).start()
-    assert began.wait(10)
-    planners.put(2, temperature=0.5)
-    assert trainings == [2]  # the first one
-    assert "Another worker trains the planner of depth 2; waiting." in capsys.readouterr().out
+    other = threading.Thread(target=train_elsewhere)
+    other.start()
+    assert began.wait(60)
+    planners.train([2, 3])
+    other.join()
+    out = capsys.readouterr().out
+    assert "Another worker trains the planner of depth 2." in out
+    assert out.count("Training the planner of depth 2") == 1  # the first one
+    assert out.count("Training the planner of depth 3") == 1
 
 
 def test_a_killed_training_goes_on_bit_for_bit(run, tmp_path, monkeypatch):
     whole = make(run, tmp_path / "whole", 6)
-    whole.put(2, temperature=0.5)
-    callback = functools.partial(PlannerTrainingCallback, save_interval=2)
-    monkeypatch.setattr(tuning, "PlannerTrainingCallback", callback)
-    halved = make(run, tmp_path / "halved", 6)
+    whole.train([2])
+    whole.put(2)
+    monkeypatch.setattr(SAID, "train_planner", functools.partialmethod(SAID.train_planner, save_interval=2))
     make_trainer, calls = SAID.make_planner_trainer, []
 
     def stopping(self, gradient_steps=None):
@@ -103,13 +108,15 @@ def test_a_killed_training_goes_on_bit_for_bit(run, tmp_path, monkeypatch):
         monkeypatch.setattr(trainer, "step", one_step)
         return trainer
 
-    monkeypatch.setattr(SAID, "make_planner_trainer", stopping)
-    with pytest.raises(KeyboardInterrupt):
-        halved.put(2, temperature=0.5)
-    assert not halved.is_ready(2) and not is_held(halved.lock(2))
-    monkeypatch.setattr(SAID, "make_planner_trainer", make_trainer)
+    halved = make(run, tmp_path / "halved", 6)
+    with monkeypatch.context() as patch:
+        patch.setattr(SAID, "make_planner_trainer", stopping)
+        with pytest.raises(KeyboardInterrupt):
+            halved.train([2])
+    assert not halved.path(2).exists()
     again = make(run, tmp_path / "halved", 6)
-    again.put(2, temperature=0.5)
+    again.train([2])
+    again.put(2)
     same_planner(whole, again)
     # The expert is the run's, whatever the planner.
     expert = SAID.load(run / "agent.zip", device="cpu").policy.actor.state_dict()
@@ -117,32 +124,36 @@ def test_a_killed_training_goes_on_bit_for_bit(run, tmp_path, monkeypatch):
 
 
 def test_planners_of_another_training_are_refused(run, tmp_path):
-    make(run, tmp_path, 2).put(2, temperature=0.5)
+    make(run, tmp_path, 2).train([2])
     with pytest.raises(ValueError, match=r"gradient_steps was 2 and is now 4.*delete the file"):
-        make(run, tmp_path, 4).put(2, temperature=0.5)
+        make(run, tmp_path, 4).put(2)
 
 
-def test_how_a_planner_answers_is_no_matter_of_its_training(run, tmp_path, trainings):
-    first = make(run, tmp_path, 2)
-    first.put(2, temperature=0.5)
-    again = make(run, tmp_path, 2, n_candidates=3, solver="dpmsolver++2m")
+def test_a_replay_of_another_step_is_refused(run, tmp_path):
+    planners = make(run, tmp_path)
+    planners.model.num_timesteps += 1
+    with pytest.raises(ValueError, match="finish the run first: sb3-said train --resume"):
+        planners.train([2])
+
+
+def test_how_a_planner_answers_is_no_matter_of_its_training(run, tmp_path, capsys):
+    make(run, tmp_path, 2).train([2])
+    again = make(run, tmp_path, 2, n_candidates=3, scored_states="all")
+    again.train([2])
     again.put(2, temperature=0.1, sampling_steps=4)
-    assert trainings == [2]  # the same weights, other answers
-    config = again.model.policy.planner.config
+    assert trainings(capsys) == 1  # the same weights, other answers
+    config = config_of(again)
     assert (config.depth, config.temperature, config.n_candidates, config.sampling_steps) == (2, 0.1, 3, 4)
-    assert first.training_settings(2) == again.training_settings(2)
-    # Returns of other answers cannot be compared.
-    differing = first.trial_settings()["config"].items() ^ again.trial_settings()["config"].items()
-    assert {name for name, _ in differing} == {"n_candidates", "solver"}
 
 
 def test_an_agent_with_a_planner_put_in_is_saved_with_it(run, tmp_path):
     planners = make(run, tmp_path, 2)
+    planners.train([2, 3])
     for depth, temperature in ((2, 0.3), (3, 0.0), (2, 0.7)):
         planners.put(depth, temperature=temperature)
         planners.model.save(tmp_path / "agent.zip")
         loaded = SAID.load(tmp_path / "agent.zip", device="cpu")
-        assert loaded.policy.planner.config == planners.model.policy.planner.config
+        assert loaded.policy.planner.config == config_of(planners)
         assert (loaded.policy.planner.config.depth, loaded.policy.planner.config.temperature) == (depth, temperature)
         assert loaded.planner_kwargs["depth"] == depth and loaded.policy.planner_updates == 2
         th.testing.assert_close(loaded.policy.state_dict(), planners.model.policy.state_dict(), rtol=0, atol=0)
@@ -150,17 +161,16 @@ def test_an_agent_with_a_planner_put_in_is_saved_with_it(run, tmp_path):
 
 def test_planners_have_the_runs_settings_whatever_the_defaults_are_then(run, tmp_path, monkeypatch):
     expected = make(run, tmp_path / "before")
-    expected.put(1, temperature=0.5)
-    expected.put(2, temperature=0.5)
+    expected.train([1, 2])
+    expected.put(2)
     defaults = list(PlannerConfig.__init__.__defaults__)
     names = [field.name for field in fields(PlannerConfig)]
-    for name, value in {"embed_known": False, "solver": "dpmsolver++2m"}.items():
+    for name, value in {"embed_known": False, "scored_states": "all"}.items():
         assert defaults[names.index(name)] != value
         defaults[names.index(name)] = value
     monkeypatch.setattr(PlannerConfig.__init__, "__defaults__", tuple(defaults))
     planners = make(run, tmp_path / "after")
-    planners.put(1, temperature=0.5)  # the run's own
-    planners.put(2, temperature=0.5)  # trained anew
-    assert planners.config == expected.config
-    assert planners.model.policy.planner.config == expected.model.policy.planner.config
+    planners.train([1, 2])
+    planners.put(2)
+    assert config_of(planners) == config_of(expected)
     same_planner(planners, expected)

@@ -1,0 +1,93 @@
+"""What the command lines share: parsers, delays, the options of an agent that plays, and how errors are told."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from sb3_said.delays.text import age_range, make_process
+
+#: A delay as YAML has it: control steps, [low, high], or a process as text; None for a task without the wrapper.
+Delay = int | list[int] | str | None
+
+DELAY_HELP = (
+    "age of observations in control steps; LOW HIGH: drawn anew each episode; or a process of docs/delays.md, such as "
+    "'DroppedPackets(4, p=0.1)'"
+)
+
+
+def make_parser(description: str | None, epilog: str, **kwargs: Any) -> argparse.ArgumentParser:
+    """Return a parser that shows an epilog as it is written."""
+    return argparse.ArgumentParser(
+        description=description, epilog=epilog, formatter_class=argparse.RawDescriptionHelpFormatter, **kwargs
+    )
+
+
+def add_delay(parser: argparse.ArgumentParser, default: str, name: str = "--delay", help: str = DELAY_HELP) -> None:
+    """Give a command line an option of a delay, to be read by ``read_delay``.
+
+    :param default: what leaving it out means
+    """
+    parser.add_argument(name, nargs="+", default=[], metavar="STEPS", help=f"{help} (default: {default})")
+
+
+def add_run(parser: argparse.ArgumentParser, episodes: int) -> None:
+    """Give a command line the options of one agent and how it plays."""
+    parser.add_argument("run", metavar="RUN_OR_ZIP", help="run folder of a training, or an agent's .zip")
+    parser.add_argument("--algo", help="algorithm of a .zip without its run folder")
+    parser.add_argument("--env", help="task to play (default: the trained one)")
+    add_delay(parser, default="the trained one")
+    parser.add_argument("--episodes", type=int, default=episodes, help=f"whole episodes (default: {episodes})")
+    parser.add_argument("--seed", type=int, default=10_000, help="reset seed of the first episode (default: 10000)")
+    parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the best")
+    parser.add_argument("--device", default="auto", help="torch device (default: auto)")
+
+
+def check_positive(args: argparse.Namespace, *names: str) -> None:
+    """
+    :raises ValueError: for an option below 1
+    """
+    for name in names:
+        value = getattr(args, name)
+        if value is not None and value < 1:
+            raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {value}.")
+
+
+@contextmanager
+def explained(parser: argparse.ArgumentParser) -> Iterator[None]:
+    """End with a message, not with a traceback, where the user can help it."""
+    try:
+        yield
+    except ValueError as error:
+        parser.error(str(error))
+    except ImportError as error:
+        parser.exit(1, f"{error}\n")
+    except KeyboardInterrupt:
+        parser.exit(130, "\nInterrupted; the same command goes on.\n")
+
+
+def read_delay(words: list[str]) -> Delay:
+    """Return what was given to ``--delay`` in the form that YAML and the wrapper take.
+
+    :raises ValueError: for anything but N, LOW HIGH or one process
+    """
+    if not words:
+        return None
+    numbers = [int(word) for word in words if word.removeprefix("-").isdigit()]
+    if len(words) > 2 or len(numbers) not in (0, len(words)) or (not numbers and len(words) > 1):
+        raise ValueError(f"--delay takes N, or LOW HIGH, or one process in quotes, got {' '.join(words)}.")
+    delay: int | list[int] | str = words[0] if not numbers else numbers[0] if len(numbers) == 1 else numbers
+    make_process(delay)
+    return delay
+
+
+def largest_delay(delay: Delay) -> int:
+    """Return the largest age that a delay can bring, 0 without one."""
+    return 0 if delay is None else make_process(delay).max_delay
+
+
+def is_always(delay: Delay, age: int) -> bool:
+    """Say whether a delay makes all observations amid an episode as old as this."""
+    return age_range(0 if delay is None else delay) == (age, age)

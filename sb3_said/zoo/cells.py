@@ -1,0 +1,111 @@
+"""What agents did under several delays: cells in a JSON file that other calls go on from, and their table."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_said.delays.text import make_process
+from sb3_said.evaluation import Summary, bootstrap_interval
+from sb3_said.files.atomic import write_json
+
+
+@dataclass
+class Cell:
+    """One agent under one delay, and what it did."""
+
+    agent: str
+    answer: str | None
+    """planner or expert of a SAID agent"""
+    delay: int | str
+    """control steps, or a process as it was written"""
+    algo: str
+    file: str
+    sha256: str
+    """of the file"""
+    trained_steps: int
+    obstacle: str | None
+    """why the agent cannot play this delay"""
+    origin: int | None = None
+    """which of the file's origins made the result"""
+    result: dict[str, Any] | None = None
+    """a summary without its label, which the cell has"""
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        """What was played, whatever it is called."""
+        return self.sha256, str(self.answer), repr(make_process(self.delay))
+
+
+class Results:
+    """What was played, in a JSON file that is whole at any time.
+
+    :param path: of the file; new where there is none
+    :param settings: what all cells have in common; those of the file by default
+    :raises ValueError: for a file with other settings, and without settings for a file that is not there
+    """
+
+    def __init__(self, path: Path, settings: dict[str, Any] | None = None):
+        self.path = path
+        if settings is None and not path.exists():
+            raise ValueError(f"{path} does not exist, and no runs are given: name the runs to play.")
+        document = json.loads(path.read_text()) if path.exists() else {**(settings or {}), "origins": [], "cells": []}
+        self.origins: list[dict[str, Any]] = document.pop("origins", [])
+        self.cells = [Cell(**entry) for entry in document.pop("cells", [])]
+        self.settings = document if settings is None else settings
+        if document != self.settings:
+            raise ValueError(f"{path} holds {document}, but {settings} is to be played: give another --json.")
+
+    def ask(self, cells: list[Cell]) -> None:
+        """Put these cells first, with the results that are known; drop those of agents that have changed since."""
+        known = {cell.key: cell for cell in self.cells if cell.result is not None}
+        for cell in cells:
+            if cell.obstacle is None and (old := known.get(cell.key)) is not None:
+                cell.origin, cell.result = old.origin, old.result
+        asked, files = {cell.key for cell in cells}, {cell.file: cell.sha256 for cell in cells}
+        others = [cell for cell in self.cells if cell.key not in asked]
+        self.cells = cells + [cell for cell in others if files.get(cell.file, cell.sha256) == cell.sha256]
+
+    def write(self) -> None:
+        """Write the file, whole or not at all, without the cells that are still to be played."""
+        cells = [asdict(cell) for cell in self.cells if cell.result is not None or cell.obstacle is not None]
+        write_json(self.path, {**self.settings, "origins": self.origins, "cells": cells})
+
+
+def make_table(cells: list[Cell], rows: list[str]) -> dict[str, dict[int | str, Summary]]:
+    """Return for each row's agent what it did under each delay that it could play."""
+    table: dict[str, dict[int | str, Summary]] = {row: {} for row in rows}
+    for cell in cells:
+        if cell.agent in table and (result := cell.result) is not None:
+            table[cell.agent][cell.delay] = Summary.from_episodes(cell.agent, result["returns"], result["lengths"])
+    return table
+
+
+def print_table(table: dict[str, dict[int | str, Summary]], delays: list[int | str]) -> None:
+    """Print a Markdown table: one row for each agent, one column for each delay, then the averages."""
+    columns: dict[str, list[int | str]] = {str(delay): [delay] for delay in delays}
+    for name, kind in (("mean of fixed", int), ("mean of random", str)):
+        columns[name] = [delay for delay in delays if isinstance(delay, kind)]
+    rows = [["return under delay", *columns]]
+    rows += [[agent, *(average(row, column) for column in columns.values())] for agent, row in table.items()]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    rows.insert(1, ["-" * width for width in widths])
+    for row in rows:
+        print("| " + " | ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)) + " |")
+
+
+def average(row: dict[int | str, Summary], delays: list[int | str]) -> str:
+    """Write the mean return over delays, with its interval over reset seeds.
+
+    :param row: of an agent
+    :param delays: those that the agent cannot play are left out, and the rest is counted
+    """
+    returns = [row[delay].returns for delay in delays if delay in row]
+    if not returns:
+        return "-"
+    interval = str(bootstrap_interval(np.mean(returns, axis=0)))  # from (delays, n_episodes)
+    return interval if len(returns) == len(delays) else f"{interval}, {len(returns)} of {len(delays)}"

@@ -1,0 +1,148 @@
+"""A run's planners of several depths, each trained once, however many workers and trials ask for it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch as th
+from filelock import FileLock, Timeout
+from stable_baselines3.common.logger import Logger, make_output_format
+
+from sb3_said.files.archive import load_tree, save_tree
+from sb3_said.planner.config import SAMPLING_SETTINGS
+from sb3_said.said.said import PLANNER_CHECKPOINT_NAME, SAID
+from sb3_said.zoo.manager import log_suffix
+
+
+class DepthPlanners:
+    """Trains planners of any depth on a run's replay, and puts them into its agent.
+
+    A depth's weights are kept in ``FOLDER/planner_depthN.zip``, for all workers. The run's own planner serves its depth
+    when it had as many updates. The agent's planner is replaced in place; its expert stays as it is.
+
+    :param model: the run's agent
+    :param checkpoint: the run's ``checkpoint.zip``, which holds the replay; read when a planner has to be trained
+    :param folder: for the planners
+    :param gradient_steps: updates of each planner; the agent's ``planner_gradient_steps`` by default
+    :param progress_bar: show one while training
+    """
+
+    def __init__(
+        self,
+        model: SAID,
+        checkpoint: Path,
+        folder: Path,
+        gradient_steps: int | None = None,
+        progress_bar: bool = False,
+    ):
+        self.model, self.checkpoint, self.folder, self.progress_bar = model, checkpoint, folder, progress_bar
+        self.gradient_steps = gradient_steps or model.planner_gradient_steps
+        self.config = model.policy.planner.config
+        serves = int(model.policy.planner_updates) == self.gradient_steps
+        self._own = model.policy.planner if serves else None
+        self._depth: int | None = None
+
+    def path(self, depth: int) -> Path:
+        """Where the planner of a depth is kept."""
+        return self.folder / f"planner_depth{depth}.zip"
+
+    def settings(self, depth: int) -> dict[str, Any]:
+        """Return what decides how an agent with a planner of this depth answers, in JSON types."""
+        model = self.model
+        return {
+            "gradient_steps": self.gradient_steps,
+            "newest_fraction": model.planner_newest_fraction,
+            "terminal_penalty": model.planner_terminal_penalty,
+            "training_seed": model.seed or 0,
+            "trained_steps": model.num_timesteps,
+            **replace(self.config, depth=depth).to_dict(),
+        }
+
+    def train(self, depths: Sequence[int]) -> None:
+        """Train each depth unless it is there; first those that no other worker trains, then wait for the rest.
+
+        A training that died goes on from its checkpoint.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        for waits in (False, True):
+            for depth in depths:
+                try:
+                    with FileLock(self.folder / f"planner_depth{depth}.lock").acquire(blocking=waits):
+                        if not self.path(depth).exists():
+                            self._train(depth)
+                except Timeout:
+                    print(f"Another worker trains the planner of depth {depth}.", flush=True)
+
+    def put(self, depth: int, **sampling: Any) -> None:
+        """Let the agent answer with the planner of this depth, which is trained.
+
+        :param sampling: how it answers, see :meth:`~sb3_said.said.SAID.set_planner`
+        :raises ValueError: when the planner in the folder is of another training
+        """
+        if self._depth != depth:
+            saved = load_tree(self.path(depth))
+            advice = "Tune as before, or into another folder, or delete the file to train anew."
+            check_same(f"{self.path(depth)} was trained", saved["settings"], self._weight_settings(depth), advice)
+            self._make_planner(depth)
+            self.model.policy.planner.load_state_dict(saved["planner"])
+            self.model.policy.planner_updates.fill_(float(self.gradient_steps))
+            self._depth = depth
+        self.model.set_planner(**sampling)
+
+    def _weight_settings(self, depth: int) -> dict[str, Any]:
+        return {key: value for key, value in self.settings(depth).items() if key not in SAMPLING_SETTINGS}
+
+    def _make_planner(self, depth: int) -> None:
+        with th.random.fork_rng(devices=[]):  # the same weights to begin with, whichever worker trains them
+            th.manual_seed(self.model.seed or 0)
+            self.model.policy.make_planner(replace(self.config, depth=depth))
+
+    def _train(self, depth: int) -> None:
+        planner = self._own
+        if planner is None or planner.config.depth != depth:
+            self._depth = None
+            self._make_planner(depth)
+            self._load_replay()
+            self._train_planner(depth)
+            planner = self.model.policy.planner
+        save_tree(self.path(depth), {"settings": self._weight_settings(depth), "planner": dict(planner.state_dict())})
+
+    def _load_replay(self) -> None:
+        buffer = self.model.replay_buffer
+        if buffer.size() > 0:
+            return
+        state = load_tree(self.checkpoint)
+        steps = state["counters"]["num_timesteps"]
+        if steps != self.model.num_timesteps:
+            raise ValueError(
+                f"The agent has seen {self.model.num_timesteps} steps, the replay in {self.checkpoint} is of step "
+                f"{steps}; finish the run first: sb3-said train --resume {self.checkpoint.parent}"
+            )
+        buffer.load_state_dict(state["replay_buffer"])
+
+    def _train_planner(self, depth: int) -> None:
+        folder = self.folder / f"planner_depth{depth}"
+        folder.mkdir(exist_ok=True)
+        log = make_output_format("csv", str(folder), log_suffix(folder, 0))
+        self.model.set_logger(Logger(str(folder), [log]))
+        print(f"Training the planner of depth {depth}: {self.gradient_steps} updates", flush=True)
+        try:
+            self.model.train_planner(self.gradient_steps, folder, self.progress_bar)
+        finally:
+            self.model.logger.close()
+        if int(self.model.policy.planner_updates) < self.gradient_steps:
+            raise KeyboardInterrupt  # what was learned is kept, but half a planner serves no comparison
+        (folder / PLANNER_CHECKPOINT_NAME).unlink(missing_ok=True)
+
+
+def check_same(what: str, before: dict[str, Any], now: dict[str, Any], advice: str) -> None:
+    """Compare settings.
+
+    :raises ValueError: naming those that differ
+    """
+    if differing := [key for key in sorted({*before, *now}) if before.get(key) != now.get(key)]:
+        changes = "; ".join(f"{key} was {before.get(key)} and is now {now.get(key)}" for key in differing)
+        raise ValueError(f"{what} with other settings: {changes}. {advice}")

@@ -1,0 +1,49 @@
+"""Presets: the hyper-parameters in ``zoo_configs/`` that one word on the command line changes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sb3_said.planner import PlannerConfig
+from sb3_said.zoo.arguments import Delay, is_always, largest_delay
+
+PRESETS = ("cpu", "paper", "smoke", "quick")
+
+_INSTALLED = Path(__file__).parent / "configs"  # where the wheel puts what a clone has at its top
+CONFIGS = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).resolve().parents[2] / "zoo_configs"
+
+
+def config_file(algo: str) -> Path:
+    """Return the YAML file of an algorithm; SAC, SA, DR and SADR share one."""
+    return CONFIGS / ("said.yml" if algo == "said" else "delayed_sac.yml")
+
+
+def preset_overrides(
+    config: str | Path, preset: str, env_id: str, delay: Delay, max_delay: int | None = None
+) -> dict[str, Any]:
+    """Return what a preset changes for a task: its own entry of ``presets:`` in the file, or the preset's default.
+
+    ``cpu`` changes nothing: it is the constructors' defaults. Two keys are for planners:
+    ``planner_kwargs: {base: paper, ...}`` starts from ``PlannerConfig.paper()``, and ``planner_by_delay`` holds
+    settings to add, by the largest delay and under ``varies`` for delays that are not one number.
+
+    :param max_delay: length of the action history, the largest of ``delay`` by default; a longer one varies, too
+    :raises ValueError: for a preset the file does not have
+    """
+    if preset == "cpu":
+        return {}
+    presets = (yaml.safe_load(Path(config).read_text()) or {}).get("presets", {})
+    if preset not in presets:
+        raise ValueError(f"{config} has no preset '{preset}', only {['cpu', *presets]}.")
+    overrides = dict(presets[preset].get(env_id, presets[preset]["default"]))
+    by_delay = overrides.pop("planner_by_delay", {})
+    planner = dict(overrides.get("planner_kwargs", {}))
+    if planner.pop("base", None) == "paper":
+        planner = {**PlannerConfig.paper().to_dict(), **planner}
+    planner |= by_delay.get(largest_delay(delay), {})
+    if not is_always(delay, largest_delay(delay) if max_delay is None else max_delay):
+        planner |= by_delay.get("varies", {})
+    return {**overrides, "planner_kwargs": planner} if planner else overrides

@@ -1,0 +1,203 @@
+"""A search over settings of the planner that several workers share, kept in an Optuna study."""
+
+from __future__ import annotations
+
+import math
+import sys
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import optuna
+from filelock import FileLock
+from optuna.samplers import GridSampler, TPESampler
+from optuna.storages import BaseStorage, JournalStorage, RDBStorage
+from optuna.storages.journal import JournalFileBackend
+from optuna.study import MaxTrialsCallback
+from optuna.trial import FrozenTrial, Trial, TrialState
+
+from sb3_said.zoo.depths import check_same
+
+optuna.logging.set_verbosity(optuna.logging.ERROR)
+
+FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
+
+
+class Stopped(BaseException):
+    """Ends a trial that did not finish, so that Optuna takes it for one that still runs.
+
+    ``GridSampler`` tries the cell of such a trial again at the end, and that of a failed trial never.
+    """
+
+
+def search(
+    study: optuna.Study,
+    tried: dict[str, list[Any]],
+    put: Callable[..., None],
+    play: Callable[[int, int], Sequence[float]],
+    sampler: str = "grid",
+    n_trials: int | None = None,
+    episodes: int = 20,
+    round_size: int = 5,
+    seed: int = 20_000,
+    timeout: float | None = None,
+) -> None:
+    """Try settings of the planner on the same episodes, until no trial is left to begin.
+
+    With the sampler ``grid`` every cell is tried once; at the end two workers may try the same one. ``tpe`` draws
+    temperatures between the lowest and the highest. A trial reports the return of every episode. It is pruned once a
+    Wilcoxon test of the differences to the best trial, episode by episode, says that it is worse.
+
+    :param study: see ``open_study``
+    :param tried: values of ``depth``, ``temperature`` and ``sampling_steps``
+    :param put: gives the agent such settings
+    :param play: returns what the agent earned, (n,), in n episodes from a reset seed on
+    :param sampler: ``grid`` or ``tpe``
+    :param n_trials: of the whole study, over all workers; as many as the grid has by default
+    :param episodes: of a trial
+    :param round_size: episodes between two looks at pruning
+    :param seed: reset seed of the first episode
+    :param timeout: seconds after which no trial is begun
+    """
+
+    def objective(trial: Trial) -> float:
+        params = suggest(trial, tried, sampler)
+        known = next((made for made in finished(study) if made.params == params), None)
+        if known is not None:  # of a smaller grid, in an earlier call
+            return repeat(trial, known)
+        try:
+            put(**params)
+            return play_trial(trial, play, episodes, round_size, seed)
+        except optuna.TrialPruned:
+            raise
+        except (Exception, KeyboardInterrupt) as error:
+            raise Stopped from error
+
+    grid = GridSampler(tried)
+    # Without a seed: workers that begin together are to draw differently.
+    study.sampler = grid if sampler == "grid" else TPESampler(n_startup_trials=6, constant_liar=True)
+    limit = n_trials or (math.prod(map(len, tried.values())) if sampler == "tpe" else sys.maxsize)
+    n_made = len(study.get_trials(deepcopy=False, states=FINISHED))
+    if n_made >= limit or (sampler == "grid" and grid.is_exhausted(study)):
+        print("No trial is left to make.")
+        return
+    try:
+        study.optimize(objective, timeout=timeout, callbacks=[MaxTrialsCallback(limit, states=FINISHED)])
+    except Stopped as stopped:
+        raise stopped.__cause__ or stopped from None
+
+
+def suggest(trial: Trial, tried: dict[str, list[Any]], sampler: str) -> dict[str, Any]:
+    """Let the sampler choose one of the settings."""
+    params: dict[str, Any] = {}
+    for name, values in tried.items():
+        if name == "temperature":
+            params[name] = trial.suggest_float(name, min(values), max(values))
+        elif sampler == "tpe":
+            params[name] = trial.suggest_categorical(name, values)
+        else:  # a range, which can grow with the grid; the choices of a category cannot
+            params[name] = trial.suggest_int(name, min(values), max(values))
+    return params
+
+
+def repeat(trial: Trial, known: FrozenTrial) -> float:
+    """Report what another trial of the same settings did, and end as it did."""
+    returns = returns_of(known)
+    for step, value in enumerate(returns):
+        trial.report(value, step)
+    if known.state == TrialState.PRUNED:
+        raise optuna.TrialPruned
+    return float(np.mean(returns))
+
+
+def play_trial(
+    trial: Trial, play: Callable[[int, int], Sequence[float]], episodes: int, round_size: int, seed: int
+) -> float:
+    """Report the episodes of a trial, and return their mean.
+
+    :raises TrialPruned: when it is worse than the best
+    """
+    returns: list[float] = []
+    is_pruned = False
+    while len(returns) < episodes and not is_pruned:
+        for value in play(seed + len(returns), min(round_size, episodes - len(returns))):
+            trial.report(float(value), len(returns))
+            returns.append(float(value))
+        is_pruned = len(returns) < episodes and trial.should_prune()
+    mean = float(np.mean(returns))
+    told = f"trial {trial.number}: {describe(trial.params)}: mean return {mean:,.1f} over {len(returns)} episodes"
+    print(told + " (pruned)" * is_pruned, flush=True)
+    if is_pruned:
+        raise optuna.TrialPruned
+    return mean
+
+
+def open_study(folder: Path, storage: str, name: str, settings: dict[str, Any], prune: float) -> optuna.Study:
+    """Open a study, or begin it.
+
+    :param folder: shared by the workers, for a lock
+    :param storage: an Optuna RDB URL, or the path of a journal file
+    :param settings: in JSON types, what all trials must have in common to be compared
+    :param prune: p-value below which a trial is pruned; 0 prunes none
+    :raises ValueError: when the study was begun with other settings
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with warnings.catch_warnings(), FileLock(folder / "study.lock"):
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        pruner = optuna.pruners.WilcoxonPruner(p_threshold=prune) if prune > 0 else optuna.pruners.NopPruner()
+        if "://" in storage:
+            # SQLite lets one worker write at a time, and tells the others that wait longer than this to give up.
+            patience = {"connect_args": {"timeout": 120}} if storage.startswith("sqlite") else {}
+            backend: BaseStorage = RDBStorage(storage, engine_kwargs=patience)
+        else:
+            Path(storage).parent.mkdir(parents=True, exist_ok=True)
+            backend = JournalStorage(JournalFileBackend(storage))
+        study = optuna.create_study(
+            storage=backend, study_name=name, direction="maximize", load_if_exists=True, pruner=pruner
+        )
+        if "settings" not in study.user_attrs:
+            study.set_user_attr("settings", settings)
+    advice = "Go on with the old ones, or begin another study with --study-name."
+    check_same(f"Study {name!r} in {storage} was begun", study.user_attrs["settings"], settings, advice)
+    return study
+
+
+def finished(study: optuna.Study) -> list[FrozenTrial]:
+    """Return the trials that are complete or pruned; of several with equal settings, the first."""
+    trials = study.get_trials(deepcopy=False, states=FINISHED)
+    return list({tuple(sorted(trial.params.items())): trial for trial in reversed(trials)}.values())[::-1]
+
+
+def find_winner(study: optuna.Study) -> FrozenTrial | None:
+    """Return the complete trial of the highest mean; of equals, the shallowest, quickest and coldest."""
+    complete = [trial for trial in finished(study) if trial.state == TrialState.COMPLETE]
+    return max(complete, key=lambda t: (t.value, *(-t.params[name] for name in sorted(t.params))), default=None)
+
+
+def describe(params: Mapping[str, float]) -> str:
+    """Write what was tried, such as "depth 2, temperature 0.3, sampling steps 5"."""
+    return ", ".join(f"{name.replace('_', ' ')} {value:g}" for name, value in params.items())
+
+
+def returns_of(trial: FrozenTrial) -> list[float]:
+    """Return what a trial reported: the return of each of its episodes, in the order of their seeds."""
+    return [trial.intermediate_values[step] for step in sorted(trial.intermediate_values)]
+
+
+def save_plot(study: optuna.Study, path: Path) -> None:
+    """Draw the mean return over each setting, of complete trials.
+
+    :raises ImportError: without matplotlib
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from optuna.visualization.matplotlib import plot_slice
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        axes = np.ravel(np.asarray(plot_slice(study, target_name="mean return")))
+    axes[0].figure.savefig(path, dpi=150, bbox_inches="tight")
+    matplotlib.pyplot.close(axes[0].figure)

@@ -1,0 +1,43 @@
+"""Delays on the command line: what is read, and what is refused."""
+
+from __future__ import annotations
+
+import pytest
+
+from sb3_said.zoo.arguments import Delay, is_always, largest_delay, read_delay
+
+
+@pytest.mark.parametrize(
+    ("words", "delay"),
+    [
+        ([], None),
+        (["4"], 4),
+        (["0", "8"], [0, 8]),
+        (["WIFI_20MS"], "WIFI_20MS"),
+        (["DroppedPackets(4, p=0.1)"], "DroppedPackets(4, p=0.1)"),
+    ],
+)
+def test_what_delay_takes(words: list[str], delay: Delay) -> None:
+    assert read_delay(words) == delay
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["-1"], "whole number of control steps >= 0"),
+        (["1", "2", "3"], "--delay takes N, or LOW HIGH"),
+        (["UniformDelay(0,", "8)"], "--delay takes N, or LOW HIGH"),
+        (["4", "WIFI_20MS"], "--delay takes N, or LOW HIGH"),
+        (["print(1)"], "expected numbers, WIFI_20MS, FixedDelay"),
+    ],
+)
+def test_a_bad_delay_is_refused(words: list[str], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        read_delay(words)
+
+
+@pytest.mark.parametrize(
+    ("delay", "largest", "always"), [(None, 0, True), (4, 4, True), ("FixedDelay(4)", 4, True), ([0, 4], 4, False)]
+)
+def test_a_delay_has_a_largest_age_and_may_vary(delay: Delay, largest: int, always: bool) -> None:
+    assert (largest_delay(delay), is_always(delay, largest)) == (largest, always)

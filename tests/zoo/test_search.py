@@ -1,0 +1,138 @@
+"""The search: every cell once, pruning, going on after a crash, and what cannot be compared is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rl_zoo3")
+pytest.importorskip("scipy")
+
+from optuna import Study
+from optuna.trial import TrialState
+
+from sb3_said.zoo.search import find_winner, finished, open_study, returns_of, save_plot, search
+
+
+class Agent:
+    """Answers as a search puts it, without a planner; counts how often it is put."""
+
+    def __init__(self, strength: Callable[..., float], noise: float = 0.0):
+        self.strength, self.noise = strength, noise
+        self.settings: dict[str, Any] = {}
+        self.n_put = 0
+
+    def put(self, **settings: Any) -> None:
+        self.settings = settings
+        self.n_put += 1
+
+    def play(self, seed: int, n: int) -> list[float]:
+        rngs = [np.random.default_rng((s, int(10 * self.settings["temperature"]))) for s in range(seed, seed + n)]
+        return [self.strength(**self.settings) + self.noise * float(rng.normal()) for rng in rngs]
+
+
+def run(
+    folder: Path,
+    agent: Agent,
+    temperatures: list[float],
+    steps: Sequence[int] = (5,),
+    storage: str = "",
+    prune: float = 0.0,
+    **options: Any,
+) -> Study:
+    tried = {"depth": [2], "temperature": temperatures, "sampling_steps": list(steps)}
+    study = open_study(folder, storage or str(folder / "study.log"), "test", {}, prune)
+    search(study, tried, agent.put, agent.play, **{"episodes": 2, **options})
+    return study
+
+
+def cells(study: Study) -> list[tuple[float, int]]:
+    return sorted((t.params["temperature"], t.params["sampling_steps"]) for t in finished(study))
+
+
+def test_a_hopeless_trial_is_pruned_and_a_close_one_is_not(tmp_path: Path) -> None:
+    strength = {0.0: 100.0, 0.5: 0.0, 1.0: 99.0}
+    agent = Agent(lambda temperature, **_: strength[temperature], noise=20.0)
+    for temperatures in ([0.0], [0.0, 0.5, 1.0]):  # a good one first, whatever the order of a grid
+        study = run(tmp_path, agent, temperatures, prune=0.05, episodes=20)
+    trials = {trial.params["temperature"]: trial for trial in finished(study)}
+    assert trials[0.5].state == TrialState.PRUNED and len(returns_of(trials[0.5])) == 5
+    assert trials[0.0].state == trials[1.0].state == TrialState.COMPLETE
+    winner = find_winner(study)
+    assert winner is not None and winner.params["temperature"] != 0.5 and len(returns_of(winner)) == 20
+
+
+def test_a_grid_that_grew_plays_only_what_is_new(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("matplotlib")
+    agent = Agent(lambda sampling_steps, **_: -abs(sampling_steps - 2.0))
+    for steps in ([1, 2], [1, 2], [2, 5]):
+        study = run(tmp_path, agent, [0.0, 1.0], steps)
+    assert agent.n_put == 6 and "No trial is left to make" in capsys.readouterr().out
+    assert cells(study) == [(0.0, 1), (0.0, 2), (0.0, 5), (1.0, 1), (1.0, 2), (1.0, 5)]
+    winner = find_winner(study)  # of equals, the coldest
+    assert winner is not None and winner.params == {"depth": 2, "temperature": 0.0, "sampling_steps": 2}
+    save_plot(study, tmp_path / "slice.png")
+    assert (tmp_path / "slice.png").read_bytes()[:4] == b"\x89PNG"
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError, MemoryError, SystemExit])
+def test_a_cell_that_was_not_finished_is_tried_again(error: type[BaseException], tmp_path: Path) -> None:
+    """SystemExit leaves the trial as a killed worker does: Optuna sees it run for ever."""
+    broken = Agent(lambda temperature, **_: temperature)
+
+    def play(seed: int, n: int) -> list[float]:
+        if broken.n_put == 2:
+            raise error
+        return Agent.play(broken, seed, n)
+
+    broken.play = play  # type: ignore[method-assign]
+    with pytest.raises(error):
+        run(tmp_path, broken, [0.0, 0.5, 1.0])
+    agent = Agent(lambda temperature, **_: temperature)
+    study = run(tmp_path, agent, [0.0, 0.5, 1.0])
+    assert agent.n_put == 2 and cells(study) == [(0.0, 5), (0.5, 5), (1.0, 5)]
+
+
+@pytest.mark.parametrize("sampler", ["grid", "tpe"])
+def test_no_trial_is_begun_after_the_timeout_or_the_last_one(sampler: str, tmp_path: Path) -> None:
+    agent = Agent(lambda temperature, **_: temperature)
+    run(tmp_path, agent, [0.0, 0.5, 1.0], sampler=sampler, n_trials=2, timeout=0.0)
+    assert agent.n_put == 0
+    for _ in range(2):
+        study = run(tmp_path, agent, [0.0, 0.5, 1.0], sampler=sampler, n_trials=2)
+        assert agent.n_put == len(finished(study)) == 2
+
+
+@pytest.mark.parametrize("storage", ["", "sqlite:///{}/study.db"])
+def test_tpe_tries_as_many_as_it_is_told(tmp_path: Path, storage: str) -> None:
+    agent = Agent(lambda temperature, **_: -abs(temperature - 0.5))
+    study = run(tmp_path, agent, [0.0, 1.0], [1, 5], storage.format(tmp_path), sampler="tpe", n_trials=12)
+    trials = finished(study)
+    assert len(trials) == 12 and {trial.params["sampling_steps"] for trial in trials} <= {1, 5}
+    temperatures = {trial.params["temperature"] for trial in trials}
+    assert len(temperatures) > 2 and 0.0 <= min(temperatures) <= max(temperatures) <= 1.0
+
+
+@pytest.mark.parametrize("storage", ["", "sqlite:///{}/study.db"])
+def test_workers_share_a_grid(storage: str, tmp_path: Path) -> None:
+    agents = [Agent(lambda temperature, **_: temperature) for _ in range(3)]
+    temperatures = [k / 8 for k in range(9)]
+    with ThreadPoolExecutor(3) as pool:
+        made = [pool.submit(run, tmp_path, agent, temperatures, (5,), storage.format(tmp_path)) for agent in agents]
+        studies = [one.result() for one in made]
+    assert all(cells(study) == [(t, 5) for t in temperatures] for study in studies)
+    assert sum(agent.n_put for agent in agents) < 2 * len(temperatures)  # at the end, a cell may be tried twice
+
+
+def test_a_study_begun_otherwise_is_refused(tmp_path: Path) -> None:
+    storage, settings = str(tmp_path / "study.log"), {"episodes": 2, "n_candidates": 2, "betas": [0.9, 0.999]}
+    open_study(tmp_path, storage, "test", settings, 0.0)
+    open_study(tmp_path, storage, "test", dict(settings), 0.0)
+    with pytest.raises(ValueError, match=r"settings: episodes was 2 and is now 3; n_candidates .* --study-name"):
+        open_study(tmp_path, storage, "test", {**settings, "episodes": 3, "n_candidates": 4}, 0.0)
+    open_study(tmp_path, storage, "other", {**settings, "episodes": 3}, 0.0)
