@@ -10,10 +10,10 @@ from typing import Any
 
 import gymnasium as gym
 
-from sb3_said.zoo.arguments import add_run, check_positive, explained, make_parser, read_delay
+from sb3_said.zoo.arguments import TRUST, add_run, check_positive, explained, make_parser, read_delay
 from sb3_said.zoo.runs import ANSWERS, answering, load_run
 
-EPILOG = """\
+EPILOG = f"""\
 examples:
   # three episodes in a window
   sb3-said enjoy logs/said/Hopper-v5-delay4_1 --episodes 3
@@ -26,7 +26,7 @@ examples:
 
 Without a display, MuJoCo draws through EGL (Debian, Ubuntu: apt-get install libegl1 libgl1-mesa-dri), or in software
 with MUJOCO_GL=osmesa (libosmesa6). Videos need the extra sb3_said[video].
-A run folder's YAML can run code (rl_zoo3 reads it so): open only folders that you trust.
+{TRUST}
 """
 
 

@@ -11,10 +11,10 @@ from tqdm import tqdm
 
 from sb3_said.evaluation import Summary, collect_observations, measure_latency, plots
 from sb3_said.files.atomic import write_json
-from sb3_said.zoo.arguments import add_run, check_positive, explained, make_parser, read_delay
+from sb3_said.zoo.arguments import TRUST, add_run, check_positive, explained, make_parser, read_delay
 from sb3_said.zoo.runs import LoadedRun, answering, answers, load_run, origin
 
-EPILOG = """\
+EPILOG = f"""\
 examples:
   # 20 episodes of the planner, and of the expert beside it; writes evaluation.json into the run folder
   sb3-said evaluate logs/said/Hopper-v5-delay4_1
@@ -31,7 +31,7 @@ examples:
 Episode i starts from reset seed --seed + i, so that two agents meet the same starts, and --n-envs changes only the
 speed. Returns are undiscounted sums of the task's own rewards. Decision latency is measured apart from the episodes,
 one decision at a time, from NumPy observation to NumPy action.
-A run folder's YAML can run code (rl_zoo3 reads it so): open only folders that you trust.
+{TRUST}
 """
 
 

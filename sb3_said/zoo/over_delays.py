@@ -20,11 +20,11 @@ import torch as th
 from sb3_said.delays import FixedDelay
 from sb3_said.delays.text import age_range, make_process
 from sb3_said.evaluation import Summary, plots
-from sb3_said.zoo.arguments import check_positive, explained, largest_delay, make_parser, read_delay
+from sb3_said.zoo.arguments import TRUST, check_positive, explained, largest_delay, make_parser, read_delay
 from sb3_said.zoo.cells import Cell, Results, make_table, print_table
 from sb3_said.zoo.runs import ANSWERS, LoadedRun, answering, answers, delay_name, load_run, longest_delay, origin
 
-EPILOG = """\
+EPILOG = f"""\
 examples:
   # one agent of all delays beside one of a single delay: a table, the numbers, a plot
   sb3-said over-delays logs/said/Hopper-v5-delay0-16_1 logs/sadr/Hopper-v5-delay8_1 \\
@@ -48,7 +48,7 @@ Episode i starts from reset seed --seed + i under every delay, so that all cells
 delays has an interval over these starts, each with its mean over the delays.
 What --json holds of the same agents (by the contents of their files) is not played again; an agent that has changed
 is. Cells of other agents and delays are kept in it.
-A run folder's YAML can run code (rl_zoo3 reads it so): open only folders that you trust.
+{TRUST}
 """
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-import sys
+import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -12,10 +13,9 @@ from typing import Any
 import numpy as np
 import optuna
 from filelock import FileLock
-from optuna.samplers import GridSampler, TPESampler
+from optuna.samplers import TPESampler
 from optuna.storages import BaseStorage, JournalStorage, RDBStorage
 from optuna.storages.journal import JournalFileBackend
-from optuna.study import MaxTrialsCallback
 from optuna.trial import FrozenTrial, Trial, TrialState
 
 from sb3_said.zoo.depths import check_same
@@ -23,13 +23,6 @@ from sb3_said.zoo.depths import check_same
 optuna.logging.set_verbosity(optuna.logging.ERROR)
 
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
-
-
-class Stopped(BaseException):
-    """Ends a trial that did not finish, so that Optuna takes it for one that still runs.
-
-    ``GridSampler`` tries the cell of such a trial again at the end, and that of a failed trial never.
-    """
 
 
 def search(
@@ -42,13 +35,13 @@ def search(
     episodes: int = 20,
     round_size: int = 5,
     seed: int = 20_000,
-    timeout: float | None = None,
+    timeout: float = math.inf,
 ) -> None:
     """Try settings of the planner on the same episodes, until no trial is left to begin.
 
-    With the sampler ``grid`` every cell is tried once; at the end two workers may try the same one. ``tpe`` draws
-    temperatures between the lowest and the highest. A trial reports the return of every episode. It is pruned once a
-    Wilcoxon test of the differences to the best trial, episode by episode, says that it is worse.
+    The sampler ``grid`` tries every cell that no trial has finished. ``tpe`` draws temperatures between the lowest and
+    the highest. A trial reports the return of every episode. It is pruned once a Wilcoxon test of the differences to
+    the best trial, episode by episode, says that it is worse.
 
     :param study: see ``open_study``
     :param tried: values of ``depth``, ``temperature`` and ``sampling_steps``
@@ -63,53 +56,38 @@ def search(
     """
 
     def objective(trial: Trial) -> float:
-        params = suggest(trial, tried, sampler)
-        known = next((made for made in finished(study) if made.params == params), None)
-        if known is not None:  # of a smaller grid, in an earlier call
-            return repeat(trial, known)
-        try:
-            put(**params)
-            return play_trial(trial, play, episodes, round_size, seed)
-        except optuna.TrialPruned:
-            raise
-        except (Exception, KeyboardInterrupt) as error:
-            raise Stopped from error
+        if sampler == "tpe":
+            choices = {name: trial.suggest_categorical(name, tried[name]) for name in ("depth", "sampling_steps")}
+            temperature = trial.suggest_float("temperature", min(tried["temperature"]), max(tried["temperature"]))
+        else:  # workers have different numbers: those that begin together take different cells
+            cell = left[trial.number % len(left)]
+            choices = {name: trial.suggest_int(name, cell[name], cell[name]) for name in ("depth", "sampling_steps")}
+            temperature = trial.suggest_float("temperature", cell["temperature"], cell["temperature"])
+        put(**choices, temperature=temperature)
+        return play_trial(trial, play, episodes, round_size, seed)
 
-    grid = GridSampler(tried)
     # Without a seed: workers that begin together are to draw differently.
-    study.sampler = grid if sampler == "grid" else TPESampler(n_startup_trials=6, constant_liar=True)
-    limit = n_trials or (math.prod(map(len, tried.values())) if sampler == "tpe" else sys.maxsize)
-    n_made = len(study.get_trials(deepcopy=False, states=FINISHED))
-    if n_made >= limit or (sampler == "grid" and grid.is_exhausted(study)):
-        print("No trial is left to make.")
-        return
-    try:
-        study.optimize(objective, timeout=timeout, callbacks=[MaxTrialsCallback(limit, states=FINISHED)])
-    except Stopped as stopped:
-        raise stopped.__cause__ or stopped from None
+    study.sampler = TPESampler(n_startup_trials=6, constant_liar=True)
+    limit = n_trials or (math.prod(map(len, tried.values())) if sampler == "tpe" else math.inf)
+    end = time.monotonic() + timeout
+    while time.monotonic() < end:
+        left = cells_left(study, tried)
+        if len(study.get_trials(deepcopy=False, states=FINISHED)) >= limit or (sampler == "grid" and not left):
+            print("No trial is left to make.")
+            return
+        study.optimize(objective, n_trials=1)
 
 
-def suggest(trial: Trial, tried: dict[str, list[Any]], sampler: str) -> dict[str, Any]:
-    """Let the sampler choose one of the settings."""
-    params: dict[str, Any] = {}
-    for name, values in tried.items():
-        if name == "temperature":
-            params[name] = trial.suggest_float(name, min(values), max(values))
-        elif sampler == "tpe":
-            params[name] = trial.suggest_categorical(name, values)
-        else:  # a range, which can grow with the grid; the choices of a category cannot
-            params[name] = trial.suggest_int(name, min(values), max(values))
-    return params
+def cells_left(study: optuna.Study, tried: dict[str, list[Any]]) -> list[dict[str, Any]]:
+    """Return the cells of a grid that no trial has begun, or else those that none has finished.
 
-
-def repeat(trial: Trial, known: FrozenTrial) -> float:
-    """Report what another trial of the same settings did, and end as it did."""
-    returns = returns_of(known)
-    for step, value in enumerate(returns):
-        trial.report(value, step)
-    if known.state == TrialState.PRUNED:
-        raise optuna.TrialPruned
-    return float(np.mean(returns))
+    The worker of a trial that has not finished may be dead.
+    """
+    cells = [dict(zip(tried, values, strict=True)) for values in itertools.product(*tried.values())]
+    done = [trial.params for trial in finished(study)]
+    running = [trial.params for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))]
+    left = [cell for cell in cells if cell not in done]
+    return [cell for cell in left if cell not in running] or left
 
 
 def play_trial(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import time
 from dataclasses import replace
 from importlib.util import find_spec
@@ -19,14 +20,14 @@ from sb3_said import SAID
 from sb3_said.evaluation import bootstrap_interval
 from sb3_said.files.atomic import write_json
 from sb3_said.files.checkpoint import CHECKPOINT_NAME
-from sb3_said.zoo.arguments import check_positive, explained, make_parser
+from sb3_said.zoo.arguments import TRUST, check_positive, explained, make_parser
 from sb3_said.zoo.best import write_best
 from sb3_said.zoo.depths import DepthPlanners
 from sb3_said.zoo.evaluate import evaluate
 from sb3_said.zoo.runs import ANSWERS, LoadedRun, load_run, origin
 from sb3_said.zoo.search import describe, find_winner, finished, open_study, returns_of, save_plot, search
 
-EPILOG = """\
+EPILOG = f"""\
 examples:
   # the paper's grid: three planners are trained, each is tried at six temperatures
   sb3-said tune --run logs/said/Hopper-v5-delay4_1
@@ -55,7 +56,7 @@ up, since the best of many trials looks better on its own episodes than it is.
 
 Written to RUN_DIR/tune: planner_depthN.zip, study.log (the study), results.json, best.yml, best.zip and slice.png.
 Each worker reports when it ends; what the last one writes covers all trials.
-A run folder's YAML can run code (rl_zoo3 reads it so): open only folders that you trust.
+{TRUST}
 """
 DEPTHS, TEMPERATURES = [2, 4, 8], [0.0, 0.1, 0.3, 0.6, 0.8, 1.0]
 
@@ -80,7 +81,7 @@ def main(argv: list[str] | None = None) -> None:
     add("--storage", help="Optuna RDB URL, or path of a journal file (default: study.log in the output folder)")
     add("--study-name", help="default: the run folder's name")
     add("--output", type=Path, metavar="DIR", help="default: RUN_DIR/tune")
-    add("--timeout", type=float, metavar="SECONDS", help="begin no trial after this time")
+    add("--timeout", type=float, default=math.inf, metavar="SECONDS", help="begin no trial after this time")
     add("--device", default="auto", help="torch device (default: auto)")
     add("--num-threads", type=int, help="torch threads (default: torch's own choice)")
     add("-P", "--progress", action="store_true", help="show a progress bar while a planner trains")
@@ -128,7 +129,8 @@ def tune(args: argparse.Namespace) -> None:
             replace(planners.config, **{name: value})  # refuses what is no setting
     common = {"sampler": args.sampler, "episodes": args.episodes, "seed": args.seed}
     common |= {"env": run.info["env"], "delay": run.info["delay"]}
-    common |= {key: value for key, value in planners.settings(planners.config.depth).items() if key not in tried}
+    decisive = {**planners.config.to_dict(), **planners.training(planners.config.depth)}
+    common |= {key: value for key, value in decisive.items() if key not in tried}
     if args.sampler == "tpe":
         common |= {**tried, "temperature": [min(args.temperatures), max(args.temperatures)]}
     storage, name = args.storage or str(folder / "study.log"), args.study_name or args.run.resolve().name
@@ -141,7 +143,7 @@ def tune(args: argparse.Namespace) -> None:
         return [float(value) for value in run.play(n, seed, n).returns]
 
     planners.train(args.depths)
-    left = None if args.timeout is None else max(args.timeout - (time.monotonic() - began), 0.0)
+    left = args.timeout - (time.monotonic() - began)
     how = (args.sampler, args.n_trials, args.episodes, args.round, args.seed, left)
     search(study, tried, planners.put, play, *how)
     winner = find_winner(study)
