@@ -83,9 +83,9 @@ def read_delay(words: list[str]) -> Delay:
     if not words:
         return None
     numbers = [int(word) for word in words if word.removeprefix("-").isdigit()]
-    if len(words) > 2 or len(numbers) not in (0, len(words)) or (not numbers and len(words) > 1):
+    if len(words) > 1 and (len(words), len(numbers)) != (2, 2):
         raise ValueError(f"--delay takes N, or LOW HIGH, or one process in quotes, got {' '.join(words)}.")
-    delay: int | list[int] | str = words[0] if not numbers else numbers[0] if len(numbers) == 1 else numbers
+    delay: int | list[int] | str = numbers if len(words) == 2 else numbers[0] if numbers else words[0]
     make_process(delay)
     return delay
 
@@ -96,5 +96,5 @@ def largest_delay(delay: Delay) -> int:
 
 
 def is_always(delay: Delay, age: int) -> bool:
-    """Say whether a delay makes all observations amid an episode as old as this."""
+    """Say whether all observations amid an episode have this age."""
     return age_range(0 if delay is None else delay) == (age, age)

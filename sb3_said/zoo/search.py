@@ -64,7 +64,19 @@ def search(
             choices = {name: trial.suggest_int(name, cell[name], cell[name]) for name in ("depth", "sampling_steps")}
             temperature = trial.suggest_float("temperature", cell["temperature"], cell["temperature"])
         put(**choices, temperature=temperature)
-        return play_trial(trial, play, episodes, round_size, seed)
+        returns: list[float] = []
+        is_pruned = False
+        while len(returns) < episodes and not is_pruned:
+            for value in play(seed + len(returns), min(round_size, episodes - len(returns))):
+                trial.report(float(value), len(returns))
+                returns.append(float(value))
+            is_pruned = len(returns) < episodes and trial.should_prune()
+        mean = float(np.mean(returns))
+        told = f"trial {trial.number}: {describe(trial.params)}: mean return {mean:,.1f} over {len(returns)} episodes"
+        print(told + " (pruned)" * is_pruned, flush=True)
+        if is_pruned:
+            raise optuna.TrialPruned
+        return mean
 
     # Without a seed: workers that begin together are to draw differently.
     study.sampler = TPESampler(n_startup_trials=6, constant_liar=True)
@@ -88,28 +100,6 @@ def cells_left(study: optuna.Study, tried: dict[str, list[Any]]) -> list[dict[st
     running = [trial.params for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))]
     left = [cell for cell in cells if cell not in done]
     return [cell for cell in left if cell not in running] or left
-
-
-def play_trial(
-    trial: Trial, play: Callable[[int, int], Sequence[float]], episodes: int, round_size: int, seed: int
-) -> float:
-    """Report the episodes of a trial, and return their mean.
-
-    :raises TrialPruned: when it is worse than the best
-    """
-    returns: list[float] = []
-    is_pruned = False
-    while len(returns) < episodes and not is_pruned:
-        for value in play(seed + len(returns), min(round_size, episodes - len(returns))):
-            trial.report(float(value), len(returns))
-            returns.append(float(value))
-        is_pruned = len(returns) < episodes and trial.should_prune()
-    mean = float(np.mean(returns))
-    told = f"trial {trial.number}: {describe(trial.params)}: mean return {mean:,.1f} over {len(returns)} episodes"
-    print(told + " (pruned)" * is_pruned, flush=True)
-    if is_pruned:
-        raise optuna.TrialPruned
-    return mean
 
 
 def open_study(folder: Path, storage: str, name: str, settings: dict[str, Any], prune: float) -> optuna.Study:
@@ -149,18 +139,18 @@ def finished(study: optuna.Study) -> list[FrozenTrial]:
 
 
 def find_winner(study: optuna.Study) -> FrozenTrial | None:
-    """Return the complete trial of the highest mean; of equals, the shallowest, quickest and coldest."""
+    """Return the complete trial of the highest mean; of equals, that of the smallest depth, steps and temperature."""
     complete = [trial for trial in finished(study) if trial.state == TrialState.COMPLETE]
     return max(complete, key=lambda t: (t.value, *(-t.params[name] for name in sorted(t.params))), default=None)
 
 
 def describe(params: Mapping[str, float]) -> str:
-    """Write what was tried, such as "depth 2, temperature 0.3, sampling steps 5"."""
+    """Return settings as text, such as "depth 2, temperature 0.3, sampling steps 5"."""
     return ", ".join(f"{name.replace('_', ' ')} {value:g}" for name, value in params.items())
 
 
 def returns_of(trial: FrozenTrial) -> list[float]:
-    """Return what a trial reported: the return of each of its episodes, in the order of their seeds."""
+    """Return the returns of a trial's episodes, in the order of their seeds."""
     return [trial.intermediate_values[step] for step in sorted(trial.intermediate_values)]
 
 
