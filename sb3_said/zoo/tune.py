@@ -17,12 +17,13 @@ from optuna import Study
 from optuna.trial import FrozenTrial
 
 from sb3_said import SAID
+from sb3_said.evaluation import Latency, Summary
 from sb3_said.files.atomic import write_json
 from sb3_said.files.checkpoint import CHECKPOINT_NAME
 from sb3_said.zoo.arguments import TRUST, check_positive, explained, make_parser
 from sb3_said.zoo.best import write_best
 from sb3_said.zoo.depths import DepthPlanners
-from sb3_said.zoo.evaluate import evaluate
+from sb3_said.zoo.evaluate import evaluate, print_table
 from sb3_said.zoo.runs import ANSWERS, LoadedRun, load_run, origin
 from sb3_said.zoo.search import describe, find_winner, finished, open_study, returns_of, save_plot, search
 
@@ -90,8 +91,9 @@ def main(argv: list[str] | None = None) -> None:
 
 
 def check(args: argparse.Namespace) -> None:
-    """
-    :raises ValueError: for options that make no search
+    """Check the options.
+
+    :raises ValueError: naming the option that is wrong
     """
     check_positive(args, "episodes", "round", "report_episodes", "n_trials", "gradient_steps")
     if not 0 <= args.prune < 1:
@@ -125,8 +127,8 @@ def tune(args: argparse.Namespace) -> None:
             replace(planners.config, **{name: value})  # raises for a value out of range
     common = {"sampler": args.sampler, "episodes": args.episodes, "seed": args.seed}
     common |= {"env": run.info["env"], "delay": run.info["delay"]}
-    decisive = {**planners.config.to_dict(), **planners.training(planners.config.depth)}
-    common |= {key: value for key, value in decisive.items() if key not in tried}
+    common |= {**planners.config.to_dict(), **planners.training(planners.config.depth)}
+    common = {key: value for key, value in common.items() if key not in tried}
     if args.sampler == "tpe":
         common |= {**tried, "temperature": [min(args.temperatures), max(args.temperatures)]}
     storage, name = args.storage or str(folder / "study.log"), args.study_name or args.run.resolve().name
@@ -169,7 +171,7 @@ def open_run(args: argparse.Namespace) -> tuple[LoadedRun, SAID]:
 
 
 def report(args: argparse.Namespace, run: LoadedRun, study: Study, winner: FrozenTrial, folder: Path) -> None:
-    """Play the winner, which the agent has, and the expert on fresh episodes; write everything that was found."""
+    """Play the winner, which the agent has, and the expert on fresh episodes; write the files and print a summary."""
     results = folder / "results.json"
     fresh = {"study": study.study_name, "trial": winner.number, "finished": str(winner.datetime_complete)}
     fresh |= {"seed": args.report_seed, "n_episodes": args.report_episodes}
@@ -197,10 +199,9 @@ def report(args: argparse.Namespace, run: LoadedRun, study: Study, winner: Froze
     print(f"\n{len(trials)} trials, {pruned} of them pruned. Best: {describe(winner.params)}, mean return "
           f"{winner.value:,.1f} on the episodes it was chosen by.")  # fmt: skip
     print(f"On {args.report_episodes} other episodes:")
-    for one in played:
-        mean = one["mean_return"]
-        interval = "" if mean["low"] is None else f"   95 % interval [{mean['low']:,.1f}, {mean['high']:,.1f}]"
-        print(f"  {one['label']:8} {mean['value']:12,.1f}{interval}")
+    print_table(
+        [Summary.from_episodes(p["label"], p["returns"], p["lengths"], Latency(**p["latency"])) for p in played]
+    )
     if find_spec("matplotlib") is None:
         print('No plot: it needs matplotlib, pip install "sb3_said[plots]"')
     else:
