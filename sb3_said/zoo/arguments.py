@@ -1,4 +1,4 @@
-"""What the command lines share: parsers, delays, the options of an agent that plays, and how errors are told."""
+"""What the command lines share: parsers, options, delays and error messages."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ from sb3_said.delays.text import age_range, make_process
 Delay = int | list[int] | str | None
 
 DELAY_HELP = (
-    "age of observations in control steps; LOW HIGH: drawn anew each episode; or a process of docs/delays.md, such as "
-    "'DroppedPackets(4, p=0.1)'"
+    "age of the observations in control steps; with LOW HIGH, each episode draws one between them; or a process of "
+    "docs/delays.md in quotes, such as 'DroppedPackets(4, p=0.1)'"
 )
+
+TRUST = "A run folder's YAML can run code, since rl_zoo3 reads it so: open only folders that you trust."
 
 
 def make_parser(description: str | None, epilog: str, **kwargs: Any) -> argparse.ArgumentParser:
@@ -33,16 +35,21 @@ def add_delay(parser: argparse.ArgumentParser, default: str, name: str = "--dela
     parser.add_argument(name, nargs="+", default=[], metavar="STEPS", help=f"{help} (default: {default})")
 
 
+def add_playing(parser: argparse.ArgumentParser, episodes: int) -> None:
+    """Give a command line the options of how trained agents play."""
+    parser.add_argument("--algo", help="algorithm of a .zip without its run folder")
+    parser.add_argument("--env", help="task to play (default: the trained one)")
+    parser.add_argument("--episodes", type=int, default=episodes, help=f"whole episodes to play (default: {episodes})")
+    parser.add_argument("--seed", type=int, default=10_000, help="reset seed of the first episode (default: 10000)")
+    parser.add_argument("--device", default="auto", help="torch device (default: auto)")
+
+
 def add_run(parser: argparse.ArgumentParser, episodes: int) -> None:
     """Give a command line the options of one agent and how it plays."""
     parser.add_argument("run", metavar="RUN_OR_ZIP", help="run folder of a training, or an agent's .zip")
-    parser.add_argument("--algo", help="algorithm of a .zip without its run folder")
-    parser.add_argument("--env", help="task to play (default: the trained one)")
     add_delay(parser, default="the trained one")
-    parser.add_argument("--episodes", type=int, default=episodes, help=f"whole episodes (default: {episodes})")
-    parser.add_argument("--seed", type=int, default=10_000, help="reset seed of the first episode (default: 10000)")
+    add_playing(parser, episodes)
     parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the best")
-    parser.add_argument("--device", default="auto", help="torch device (default: auto)")
 
 
 def check_positive(args: argparse.Namespace, *names: str) -> None:
@@ -57,7 +64,7 @@ def check_positive(args: argparse.Namespace, *names: str) -> None:
 
 @contextmanager
 def explained(parser: argparse.ArgumentParser) -> Iterator[None]:
-    """End with a message, not with a traceback, where the user can help it."""
+    """Turn errors that a user can mend into a message without a traceback."""
     try:
         yield
     except ValueError as error:
@@ -65,20 +72,20 @@ def explained(parser: argparse.ArgumentParser) -> Iterator[None]:
     except ImportError as error:
         parser.exit(1, f"{error}\n")
     except KeyboardInterrupt:
-        parser.exit(130, "\nInterrupted; the same command goes on.\n")
+        parser.exit(130, "\nInterrupted. Give the same command again to go on.\n")
 
 
 def read_delay(words: list[str]) -> Delay:
-    """Return what was given to ``--delay`` in the form that YAML and the wrapper take.
+    """Return the words of ``--delay`` in the form that YAML and the wrapper take.
 
     :raises ValueError: for anything but N, LOW HIGH or one process
     """
     if not words:
         return None
     numbers = [int(word) for word in words if word.removeprefix("-").isdigit()]
-    if len(words) > 2 or len(numbers) not in (0, len(words)) or (not numbers and len(words) > 1):
+    if len(words) > 1 and (len(words), len(numbers)) != (2, 2):
         raise ValueError(f"--delay takes N, or LOW HIGH, or one process in quotes, got {' '.join(words)}.")
-    delay: int | list[int] | str = words[0] if not numbers else numbers[0] if len(numbers) == 1 else numbers
+    delay: int | list[int] | str = numbers if len(words) == 2 else numbers[0] if numbers else words[0]
     make_process(delay)
     return delay
 
@@ -89,5 +96,5 @@ def largest_delay(delay: Delay) -> int:
 
 
 def is_always(delay: Delay, age: int) -> bool:
-    """Say whether a delay makes all observations amid an episode as old as this."""
+    """Say whether all observations amid an episode have this age."""
     return age_range(0 if delay is None else delay) == (age, age)

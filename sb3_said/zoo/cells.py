@@ -1,4 +1,4 @@
-"""What agents did under several delays: cells in a JSON file that other calls go on from, and their table."""
+"""Results of agents under several delays: a JSON file that later calls add to, and a table."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sb3_said.files.atomic import write_json
 
 @dataclass
 class Cell:
-    """One agent under one delay, and what it did."""
+    """One agent under one delay, and its result."""
 
     agent: str
     answer: str | None
@@ -37,12 +37,12 @@ class Cell:
 
     @property
     def key(self) -> tuple[str, ...]:
-        """What was played, whatever it is called."""
+        """The file's contents, the answer and the delay: equal keys have equal results."""
         return self.sha256, str(self.answer), repr(make_process(self.delay))
 
 
 class Results:
-    """What was played, in a JSON file that is whole at any time.
+    """The cells of a JSON file, which is always written whole.
 
     :param path: of the file; new where there is none
     :param settings: what all cells have in common; those of the file by default
@@ -61,7 +61,7 @@ class Results:
             raise ValueError(f"{path} holds {document}, but {settings} is to be played: give another --json.")
 
     def ask(self, cells: list[Cell]) -> None:
-        """Put these cells first, with the results that are known; drop those of agents that have changed since."""
+        """Put these cells first, and fill in known results; drop cells of agents whose file has changed."""
         known = {cell.key: cell for cell in self.cells if cell.result is not None}
         for cell in cells:
             if cell.obstacle is None and (old := known.get(cell.key)) is not None:
@@ -77,7 +77,7 @@ class Results:
 
 
 def make_table(cells: list[Cell], rows: list[str]) -> dict[str, dict[int | str, Summary]]:
-    """Return for each row's agent what it did under each delay that it could play."""
+    """Return the summary of each row's agent under each delay that it could play."""
     table: dict[str, dict[int | str, Summary]] = {row: {} for row in rows}
     for cell in cells:
         if cell.agent in table and (result := cell.result) is not None:

@@ -12,7 +12,6 @@ from filelock import FileLock, Timeout
 from stable_baselines3.common.logger import Logger, make_output_format
 
 from sb3_said.files.archive import load_tree, save_tree
-from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.said.said import PLANNER_CHECKPOINT_NAME, SAID
 from sb3_said.zoo.manager import log_suffix
 
@@ -43,22 +42,20 @@ class DepthPlanners:
         self.config = model.policy.planner.config
         serves = int(model.policy.planner_updates) == self.gradient_steps
         self._own = model.policy.planner if serves else None
-        self._depth: int | None = None
 
     def path(self, depth: int) -> Path:
         """Where the planner of a depth is kept."""
         return self.folder / f"planner_depth{depth}.zip"
 
-    def settings(self, depth: int) -> dict[str, Any]:
-        """Return what decides how an agent with a planner of this depth answers, in JSON types."""
-        model = self.model
+    def training(self, depth: int) -> dict[str, Any]:
+        """Return what decides a planner's weights, in JSON types."""
         return {
             "gradient_steps": self.gradient_steps,
-            "newest_fraction": model.planner_newest_fraction,
-            "terminal_penalty": model.planner_terminal_penalty,
-            "training_seed": model.seed or 0,
-            "trained_steps": model.num_timesteps,
-            **replace(self.config, depth=depth).to_dict(),
+            "newest_fraction": self.model.planner_newest_fraction,
+            "terminal_penalty": self.model.planner_terminal_penalty,
+            "training_seed": self.model.seed or 0,
+            "trained_steps": self.model.num_timesteps,
+            **replace(self.config, depth=depth).weight_settings(),
         }
 
     def train(self, depths: Sequence[int]) -> None:
@@ -79,36 +76,27 @@ class DepthPlanners:
     def put(self, depth: int, **sampling: Any) -> None:
         """Let the agent answer with the planner of this depth, which is trained.
 
-        :param sampling: how it answers, see :meth:`~sb3_said.said.SAID.set_planner`
+        :param sampling: settings of :meth:`~sb3_said.said.SAID.set_planner`; the run's own by default
         :raises ValueError: when the planner in the folder is of another training
         """
-        if self._depth != depth:
-            saved = load_tree(self.path(depth))
-            advice = "Tune as before, or into another folder, or delete the file to train anew."
-            check_same(f"{self.path(depth)} was trained", saved["settings"], self._weight_settings(depth), advice)
-            self._make_planner(depth)
-            self.model.policy.planner.load_state_dict(saved["planner"])
-            self.model.policy.planner_updates.fill_(float(self.gradient_steps))
-            self._depth = depth
-        self.model.set_planner(**sampling)
-
-    def _weight_settings(self, depth: int) -> dict[str, Any]:
-        return {key: value for key, value in self.settings(depth).items() if key not in SAMPLING_SETTINGS}
-
-    def _make_planner(self, depth: int) -> None:
-        with th.random.fork_rng(devices=[]):  # the same weights to begin with, whichever worker trains them
-            th.manual_seed(self.model.seed or 0)
-            self.model.policy.make_planner(replace(self.config, depth=depth))
+        saved = load_tree(self.path(depth))
+        advice = "Tune as before, or into another folder, or delete the file to train anew."
+        check_same(f"{self.path(depth)} was trained", saved["settings"], self.training(depth), advice)
+        policy = self.model.policy
+        policy.make_planner(replace(self.config, depth=depth, **sampling))
+        policy.planner.load_state_dict(saved["planner"])
+        policy.planner_updates.fill_(float(self.gradient_steps))
 
     def _train(self, depth: int) -> None:
         planner = self._own
         if planner is None or planner.config.depth != depth:
-            self._depth = None
-            self._make_planner(depth)
+            with th.random.fork_rng(devices=[]):  # the same weights to begin with, whichever worker trains them
+                th.manual_seed(self.model.seed or 0)
+                self.model.policy.make_planner(replace(self.config, depth=depth))
             self._load_replay()
-            self._train_planner(depth)
+            self._update_planner(depth)
             planner = self.model.policy.planner
-        save_tree(self.path(depth), {"settings": self._weight_settings(depth), "planner": dict(planner.state_dict())})
+        save_tree(self.path(depth), {"settings": self.training(depth), "planner": dict(planner.state_dict())})
 
     def _load_replay(self) -> None:
         buffer = self.model.replay_buffer
@@ -123,16 +111,14 @@ class DepthPlanners:
             )
         buffer.load_state_dict(state["replay_buffer"])
 
-    def _train_planner(self, depth: int) -> None:
+    def _update_planner(self, depth: int) -> None:
         folder = self.folder / f"planner_depth{depth}"
         folder.mkdir(exist_ok=True)
         log = make_output_format("csv", str(folder), log_suffix(folder, 0))
         self.model.set_logger(Logger(str(folder), [log]))
         print(f"Training the planner of depth {depth}: {self.gradient_steps} updates", flush=True)
-        try:
-            self.model.train_planner(self.gradient_steps, folder, self.progress_bar)
-        finally:
-            self.model.logger.close()
+        self.model.train_planner(self.gradient_steps, folder, self.progress_bar)
+        self.model.logger.close()
         if int(self.model.policy.planner_updates) < self.gradient_steps:
             raise KeyboardInterrupt  # what was learned is kept, but half a planner serves no comparison
         (folder / PLANNER_CHECKPOINT_NAME).unlink(missing_ok=True)

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import os
 import sys
+from contextlib import closing, nullcontext
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 
-from sb3_said.zoo.arguments import add_run, check_positive, explained, make_parser, read_delay
+from sb3_said.zoo.arguments import TRUST, add_run, check_positive, explained, make_parser, read_delay
 from sb3_said.zoo.runs import ANSWERS, answering, load_run
 
-EPILOG = """\
+EPILOG = f"""\
 examples:
   # three episodes in a window
   sb3-said enjoy logs/said/Hopper-v5-delay4_1 --episodes 3
@@ -24,9 +25,8 @@ examples:
   # the expert from the same starts, as a GIF
   sb3-said enjoy logs/said/Hopper-v5-delay4_1 --answer expert --record hopper_expert.gif
 
-Without a display, MuJoCo draws through EGL (Debian, Ubuntu: apt-get install libegl1 libgl1-mesa-dri), or in software
-with MUJOCO_GL=osmesa (libosmesa6). Videos need the extra sb3_said[video].
-A run folder's YAML can run code (rl_zoo3 reads it so): open only folders that you trust.
+Videos need the extra sb3_said[video]. Without a display, MuJoCo draws through EGL; MUJOCO_GL=osmesa draws in software.
+{TRUST}
 """
 
 
@@ -61,7 +61,7 @@ class Video:
     def on_step(self, env: gym.Env[Any, Any]) -> None:
         """Take a frame, if one is due.
 
-        :raises CannotDraw: without a working GL library
+        :raises CannotDraw: without a working graphics library
         """
         rate = env.metadata.get("render_fps", self.fps)  # control steps a second
         self.fps = min(self.fps, rate)
@@ -122,34 +122,29 @@ def main(argv: list[str] | None = None) -> None:
     parser = make_parser(__doc__, EPILOG)
     add_run(parser, episodes=1)
     parser.add_argument("--record", type=Path, metavar="FILE", help="write a video (.mp4 or .gif) instead of a window")
-    parser.add_argument(
-        "--fps", type=int, default=25, help="frames a second; the video skips steps to play in real time (default: 25)"
-    )
-    parser.add_argument("--answer", choices=ANSWERS, help="who acts in a SAID agent (default: the agent)")
+    parser.add_argument("--fps", type=int, default=25, help="frames a second, at most one a step (default: 25)")
+    parser.add_argument("--answer", choices=ANSWERS, help="who acts in a SAID agent (default: the trained planner)")
     args = parser.parse_args(argv)
-    is_linux, displays = sys.platform.startswith("linux"), ("DISPLAY", "WAYLAND_DISPLAY")
-    if is_linux and not any(os.environ.get(name) for name in displays):
+    displays = [name for name in ("DISPLAY", "WAYLAND_DISPLAY") if os.environ.get(name)]
+    if sys.platform.startswith("linux") and not displays:
         if args.record is None:
             parser.error("there is no display here to open a window on: give --record FILE.mp4")
         os.environ.setdefault("MUJOCO_GL", "egl")
     with explained(parser):
         check_positive(args, "episodes", "fps")
+        video = None
         if args.record is not None:
             check_can_record(args.record)
-        drawn = {"render_mode": "human" if args.record is None else "rgb_array"}
+            video = Video(args.record, args.fps)
+        drawn = {"render_mode": "rgb_array" if video else "human"}
         run = load_run(args.run, args.algo, args.env, read_delay(args.delay), args.device, drawn)
-        video = None if args.record is None else Video(args.record, args.fps)
-        try:
-            with answering(run.model, args.answer):
-                run.play(
-                    args.episodes,
-                    args.seed,
-                    deterministic=not args.stochastic,
-                    on_step=None if video is None else video.on_step,
-                    on_episode=lambda i, ret, n: print(f"seed {args.seed + i}: return {ret:,.1f} in {n} steps"),
-                )
-        finally:
-            if video is not None:
-                video.close()
-    if video is not None:
+        with answering(run.model, args.answer), closing(video) if video else nullcontext():
+            run.play(
+                args.episodes,
+                args.seed,
+                deterministic=not args.stochastic,
+                on_step=video.on_step if video else None,
+                on_episode=lambda i, ret, n: print(f"seed {args.seed + i}: return {ret:,.1f} in {n} steps"),
+            )
+    if video:
         print(f"Wrote {args.record}: {video.frames} frames at {video.fps:g} a second")

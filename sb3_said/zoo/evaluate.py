@@ -11,27 +11,24 @@ from tqdm import tqdm
 
 from sb3_said.evaluation import Summary, collect_observations, measure_latency, plots
 from sb3_said.files.atomic import write_json
-from sb3_said.zoo.arguments import add_run, check_positive, explained, make_parser, read_delay
+from sb3_said.zoo.arguments import TRUST, add_run, check_positive, explained, make_parser, read_delay
 from sb3_said.zoo.runs import LoadedRun, answering, answers, load_run, origin
 
-EPILOG = """\
+EPILOG = f"""\
 examples:
   # 20 episodes of the planner, and of the expert beside it; writes evaluation.json into the run folder
   sb3-said evaluate logs/said/Hopper-v5-delay4_1
 
-  # the checkpoint that did best in training, with a plot
-  sb3-said evaluate logs/said/Hopper-v5-delay4_1/best_model.zip --plot hopper.png
-
-  # the same agent under a shorter delay than it was built for
-  sb3-said evaluate logs/said/Hopper-v5-delay4_1 --delay 2 --json hopper_d2.json
+  # the checkpoint that did best in training, under a shorter delay, with a plot
+  sb3-said evaluate logs/said/Hopper-v5-delay4_1/best_model.zip --delay 2 --json hopper_d2.json --plot hopper.png
 
   # an agent that came without its run folder
   sb3-said evaluate hopper.zip --algo said --env Hopper-v5 --delay 4
 
-Episode i starts from reset seed --seed + i, so that two agents meet the same starts, and --n-envs changes only the
-speed. Returns are undiscounted sums of the task's own rewards. Decision latency is measured apart from the episodes,
-one decision at a time, from NumPy observation to NumPy action.
-A run folder's YAML can run code (rl_zoo3 reads it so): open only folders that you trust.
+Episode i starts from reset seed --seed + i, so two agents meet the same starts; --n-envs changes only the speed. A
+return is the undiscounted sum of the task's own rewards. Decisions are timed after the episodes, one at a time, from
+NumPy observation to NumPy action.
+{TRUST}
 """
 
 
@@ -41,9 +38,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--n-envs", type=int, default=8, help="episodes played side by side (default: 8)")
     parser.add_argument("--latency-calls", type=int, default=200, help="decisions to time, 0 for none (default: 200)")
     parser.add_argument("--json", type=Path, help="where to write the numbers (default: RUN/evaluation.json)")
-    parser.add_argument(
-        "--plot", type=Path, help="draw returns, and the training curves there are, to this .png or .pdf"
-    )
+    parser.add_argument("--plot", type=Path, help="draw returns and training curves to this .png or .pdf")
     parser.add_argument("--num-threads", type=int, help="torch threads (default: torch's own choice)")
     args = parser.parse_args(argv)
     if args.num_threads is not None:
@@ -57,8 +52,8 @@ def main(argv: list[str] | None = None) -> None:
     last_seed = args.seed + args.episodes - 1
     print(f"{run.info['algo']} on {run.info['env']}, delay {run.info['delay']}, reset seeds {args.seed}..{last_seed}")
     settings = {"seed": args.seed, "n_envs": args.n_envs, "deterministic": not args.stochastic}
-    who: list[str | None] = [*answers(run.model)] or [None]
-    summaries = [evaluate(run, answer, args.episodes, latency_calls=args.latency_calls, **settings) for answer in who]
+    how = {**settings, "latency_calls": args.latency_calls}
+    summaries = [evaluate(run, answer, args.episodes, **how) for answer in answers(run.model)]
     print_table(summaries)
 
     document = {**run.info, "n_episodes": args.episodes, **settings}

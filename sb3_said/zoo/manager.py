@@ -170,10 +170,10 @@ class DelayedExperimentManager(ExperimentManager):
 
 
 def log_suffix(folder: Path, steps: int) -> str:
-    """Return what follows ``progress`` in the name of a log that starts now, so that no earlier one is overwritten.
+    """Return a suffix of ``progress.csv`` that no log has yet.
 
     :param folder: of the run
-    :param steps: that the run has taken
+    :param steps: environment steps that the run has taken
     """
     names = ["" if steps == 0 else f"_{steps}", *(f"_{steps}_{k}" for k in range(2, 1000))]
     return next(name for name in names if not (folder / f"progress{name}.csv").exists())
@@ -182,9 +182,9 @@ def log_suffix(folder: Path, steps: int) -> str:
 def drop_undone_episodes(run_dir: Path, steps: int) -> None:
     """Cut from SB3's monitor files the episodes that a resume undoes: those that ended after the checkpoint.
 
-    The episode amid which the checkpoint was written is in no file: what follows lags behind the run by its length.
+    The episode during which the checkpoint was written is missing from the files.
 
-    :param steps: that each environment had taken at the checkpoint
+    :param steps: environment steps up to the checkpoint, of each environment
     """
     for file in run_dir.glob("*.monitor.csv"):
         lines = file.read_bytes().splitlines(keepends=True)

@@ -20,56 +20,46 @@ import torch as th
 from sb3_said.delays import FixedDelay
 from sb3_said.delays.text import age_range, make_process
 from sb3_said.evaluation import Summary, plots
-from sb3_said.zoo.arguments import check_positive, explained, largest_delay, make_parser, read_delay
+from sb3_said.zoo.arguments import TRUST, add_playing, check_positive, explained, largest_delay, make_parser, read_delay
 from sb3_said.zoo.cells import Cell, Results, make_table, print_table
 from sb3_said.zoo.runs import ANSWERS, LoadedRun, answering, answers, delay_name, load_run, longest_delay, origin
 
-EPILOG = """\
+EPILOG = f"""\
 examples:
-  # one agent of all delays beside one of a single delay: a table, the numbers, a plot
-  sb3-said over-delays logs/said/Hopper-v5-delay0-16_1 logs/sadr/Hopper-v5-delay8_1 \\
-      --delays 0 2 4 8 12 16 "UniformDelay(0, 8)" WIFI_20MS "RandomWalkDelay(0, 16, move_prob=0.1)" \\
-      --json hopper.json --plot hopper.png
-
-  # the same call goes on where it was stopped; with another run or delay, only what is new is played
-  sb3-said over-delays any=logs/said/Hopper-v5-delay0-16_1 d8=logs/sadr/Hopper-v5-delay8_1/best_model.zip \\
-      --delays 0 2 4 8 12 16 20 --json hopper.json --workers 2
+  # an agent trained for all delays beside one trained for a single delay: a table, the numbers, a plot
+  sb3-said over-delays any=logs/said/Hopper-v5-delay0-16_1 d8=logs/sadr/Hopper-v5-delay8_1 --workers 2 \\
+      --delays 0 2 4 8 12 16 "UniformDelay(0, 8)" WIFI_20MS --json hopper.json --plot hopper.png
 
   # runs that share a label are one row: each plays the delay that it was trained under
   sb3-said over-delays any=logs/said/Hopper-v5-delay0-16_1 each=logs/said/Hopper-v5-delay0_1 \\
       each=logs/said/Hopper-v5-delay4_1 each=logs/said/Hopper-v5-delay16_1 --delays 0 4 16 --json hopper.json
 
-  # the table and the plot once more, of some rows and delays: without runs nothing is played
+  # some rows and delays again; without runs nothing is played
   sb3-said over-delays --json hopper.json --rows "any planner" "each planner" --delays 0 4 16 --plot hopper.png
 
-Of a SAID agent, the planner and the expert are played, or one of them (--answer). A delay that an agent was not built
-for leaves an empty cell; one that it was not trained with is played, without a warning.
-Episode i starts from reset seed --seed + i under every delay, so that all cells meet the same starts. An average over
-delays has an interval over these starts, each with its mean over the delays.
-What --json holds of the same agents (by the contents of their files) is not played again; an agent that has changed
-is. Cells of other agents and delays are kept in it.
-A run folder's YAML can run code (rl_zoo3 reads it so): open only folders that you trust.
+A delay longer than an agent was built for leaves an empty cell. One that it was not trained with is played, without a
+warning. Episode i starts from reset seed --seed + i in every cell. An average over delays has an interval over these
+starts.
+A call plays only the cells that --json lacks, so the same command goes on after a stop. An agent whose file has changed
+is played again. The file keeps the cells of other agents and delays.
+{TRUST}
 """
 
 
 def main(argv: list[str] | None = None) -> None:
     parser = make_parser(__doc__, EPILOG)
     parser.add_argument("runs", nargs="*", metavar="[LABEL=]RUN_OR_ZIP", help="run folders, or agents' .zip files; "
-                        "without any, what --json holds is shown")  # fmt: skip
+                        "without any, the contents of --json are shown")  # fmt: skip
     parser.add_argument("--delays", nargs="+", metavar="DELAY", help="each a number of control steps, or a process of "
                         "docs/delays.md in quotes, such as 'DroppedPackets(4, p=0.1)'")  # fmt: skip
-    parser.add_argument("--answer", choices=ANSWERS, help="of SAID agents, play this one alone (default: both)")
-    parser.add_argument("--json", type=Path, required=True, help="where to write the numbers, and to go on from them")
+    parser.add_argument("--answer", choices=ANSWERS, help="who acts in SAID agents (default: both, as two rows)")
+    parser.add_argument("--json", type=Path, required=True, help="file of the numbers, read and written")
     parser.add_argument("--plot", type=Path, help="draw return over delay to this .png or .pdf")
     parser.add_argument("--rows", nargs="+", metavar="ROW", help="rows of the table and the plot, in this order, each "
                         "a label, and 'LABEL planner' or 'LABEL expert' of a SAID agent (default: all)")  # fmt: skip
-    parser.add_argument("--episodes", type=int, default=20, help="whole episodes for each cell (default: 20)")
-    parser.add_argument("--seed", type=int, default=10_000, help="reset seed of the first episode (default: 10000)")
+    add_playing(parser, episodes=20)
     parser.add_argument("--n-envs", type=int, default=8, help="episodes played side by side (default: 8)")
     parser.add_argument("--workers", type=int, default=1, help="cells played at once, in processes (default: 1)")
-    parser.add_argument("--algo", help="algorithm of .zip files without their run folder")
-    parser.add_argument("--env", help="task to play (default: the trained one)")
-    parser.add_argument("--device", default="auto", help="torch device (default: auto)")
     parser.add_argument("--num-threads", type=int, default=1, help="torch threads of each worker (default: 1)")
     args = parser.parse_args(argv)
     with explained(parser):
@@ -192,7 +182,7 @@ def open_runs(args: argparse.Namespace) -> dict[str, list[LoadedRun]]:
 
 @contextmanager
 def at_any_age() -> Iterator[None]:
-    """Leave out the warning that an agent was not trained at some ages, which is what is measured here."""
+    """Hide the warning that an agent was not trained at some ages: to play such ages is the purpose here."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", r"This \w+ learned at ages .* and is given", UserWarning)
         yield
@@ -205,7 +195,7 @@ def cells_of(label: str, row: list[LoadedRun], delays: list[int | str], only: st
     :param only: who of a SAID agent is to answer, planner or expert; both by default
     """
     digests = [hashlib.sha256(Path(run.info["file"]).read_bytes()).hexdigest() for run in row]
-    who: list[list[str | None]] = [[*answers(run.model)] or [None] for run in row]
+    who = [answers(run.model) for run in row]
     for answer, delay in itertools.product(dict.fromkeys(itertools.chain(*who)), delays):
         for run, digest, can_answer in zip(row, digests, who, strict=True):
             plays = len(row) == 1 or run.info["delay"] == delay_name(make_process(delay))

@@ -110,21 +110,21 @@ def load_run(
 
 
 def delay_name(process: DelayProcess) -> int | str:
-    """Return the number of a fixed delay, and another process written out."""
+    """Return the number of a fixed delay, and any other process as text."""
     return process.delay if isinstance(process, FixedDelay) else str(process)
 
 
-def answers(model: BaseAlgorithm) -> list[str]:
-    """Return who can answer for a model by name: SAID's expert, and its planner once that is trained."""
+def answers(model: BaseAlgorithm) -> list[str | None]:
+    """Return who can answer: SAID's expert, and its planner once that is trained; None for another agent alone."""
     if not hasattr(model.policy, "answering"):
-        return []
+        return [None]
     return [who for who in ANSWERS if who != "planner" or model.policy.planner_is_trained]
 
 
 def answering(model: BaseAlgorithm, answer: str | None) -> AbstractContextManager[Any]:
     """Let one of ``answers(model)`` answer inside the context; None leaves the model as it is.
 
-    :raises ValueError: for another answer
+    :raises ValueError: for an answer that the model does not have
     """
     if answer is None:
         return nullcontext()
@@ -158,21 +158,20 @@ def origin(run: LoadedRun) -> dict[str, Any]:
 
 def _find(path: Path) -> tuple[Path, Path | None]:
     """Return the agent's file, and the folder of its run's YAML if it lies in a run folder."""
-    if path.is_file():
-        params = sorted(path.parent.glob("*/args.yml"))
-        return path, params[0].parent if len(params) == 1 else None
-    if not path.is_dir():
+    if not path.exists():
         raise ValueError(f"{path} does not exist; give a run folder such as logs/said/Hopper-v5-delay4_1 or a .zip.")
-    params = sorted(path.glob("*/args.yml"))
+    params = [file.parent for file in (path if path.is_dir() else path.parent).glob("*/args.yml")]
+    if path.is_file():
+        return path, params[0] if len(params) == 1 else None
     if len(params) != 1:
         runs = sorted(str(p.parents[1]) for p in path.glob("**/args.yml"))
         hint = f"it holds the runs {', '.join(runs)}" if runs else "rl_zoo3 makes one with every training"
         raise ValueError(f"{path} is not a run folder with one */args.yml: {hint}.")
-    candidates = [path / f"{params[0].parent.name}.zip", path / "best_model.zip"]
-    for file in candidates:
-        if file.is_file():
-            return file, params[0].parent
-    raise ValueError(f"{path} has no finished agent: neither {candidates[0].name} nor {candidates[1].name}.")
+    names = f"{params[0].name}.zip", "best_model.zip"
+    for name in names:
+        if (path / name).is_file():
+            return path / name, params[0]
+    raise ValueError(f"{path} has no finished agent: neither {names[0]} nor {names[1]}.")
 
 
 def read_params(params: Path | None) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -202,12 +201,10 @@ def _with_delay(wrappers: list[Any], delay: Delay, model: BaseAlgorithm) -> list
     kwargs: dict[str, Any] = {"delay": max_delay if delay is None else delay, "max_delay": max_delay}
     if has_state_history(model.observation_space):
         kwargs["state_history"] = True
-    name = WRAPPER.rsplit(".", 1)[1]
-    is_delay = [name in str(wrapper) for wrapper in wrappers]
-    if not any(is_delay):
-        return [*wrappers, {WRAPPER: kwargs}]
-    old = [next(iter(w.values())) if isinstance(w, dict) else {} for w in wrappers]
-    return [{WRAPPER: {**o, **kwargs}} if d else w for w, o, d in zip(wrappers, old, is_delay, strict=True)]
+    given = [next(iter(w.items())) if isinstance(w, dict) else (w, {}) for w in wrappers]
+    if not any("DelayedObservationWrapper" in str(name) for name, _ in given):
+        given.append((WRAPPER, {}))
+    return [{name: {**old, **kwargs} if "DelayedObservationWrapper" in str(name) else old} for name, old in given]
 
 
 def _check_spaces(model: BaseAlgorithm, env: gym.Env[Any, Any], file: Path) -> None:

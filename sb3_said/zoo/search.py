@@ -42,7 +42,7 @@ def search(
     episodes: int = 20,
     round_size: int = 5,
     seed: int = 20_000,
-    timeout: float | None = None,
+    timeout: float = math.inf,
 ) -> None:
     """Try settings of the planner on the same episodes, until no trial is left to begin.
 
@@ -84,7 +84,11 @@ def search(
         print("No trial is left to make.")
         return
     try:
-        study.optimize(objective, timeout=timeout, callbacks=[MaxTrialsCallback(limit, states=FINISHED)])
+        study.optimize(
+            objective,
+            timeout=None if timeout == math.inf else timeout,
+            callbacks=[MaxTrialsCallback(limit, states=FINISHED)],
+        )
     except Stopped as stopped:
         raise stopped.__cause__ or stopped from None
 

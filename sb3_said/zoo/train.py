@@ -72,7 +72,7 @@ def read_command_line(argv: list[str]) -> tuple[Run, str, list[str]]:
     """Return what the command line adds to rl_zoo3's, the algorithm, and what is left for rl_zoo3.
 
     :param argv: with ``--resume``, what changes in the command line that the run was started with
-    :raises ValueError: for a folder without a run, a delay that is none, or an expert's delay without a planner
+    :raises ValueError: for a folder without a run, a bad delay, or an expert's delay without a planner
     """
     resuming = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     resuming.add_argument("--resume", type=Path)
@@ -88,10 +88,10 @@ def read_command_line(argv: list[str]) -> tuple[Run, str, list[str]]:
 
 
 def joined_settings(argv: list[str]) -> list[str]:
-    """Return a command line in which each option of KEY:VALUE words stands once, last, with the words of all its uses.
+    """Join the repeated uses of each option of KEY:VALUE words, and put it last.
 
-    rl_zoo3 reads only the last use, by which a resume that changes one setting would drop the others. Of one key given
-    twice, rl_zoo3 takes the later value.
+    rl_zoo3 reads only the last use of an option, so a resume that changes one setting would drop the others. Of a key
+    given twice, it takes the later value.
     """
     settings = argparse.ArgumentParser(add_help=False, allow_abbrev=False)  # "--env" is not short for "--env-kwargs"
     for names in (("-params", "--hyperparams"), ("--env-kwargs",), ("--eval-env-kwargs",)):

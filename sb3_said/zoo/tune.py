@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import time
 from dataclasses import replace
 from importlib.util import find_spec
@@ -16,46 +17,42 @@ from optuna import Study
 from optuna.trial import FrozenTrial
 
 from sb3_said import SAID
-from sb3_said.evaluation import bootstrap_interval
+from sb3_said.evaluation import Latency, Summary
 from sb3_said.files.atomic import write_json
 from sb3_said.files.checkpoint import CHECKPOINT_NAME
-from sb3_said.zoo.arguments import check_positive, explained, make_parser
+from sb3_said.zoo.arguments import TRUST, check_positive, explained, make_parser
 from sb3_said.zoo.best import write_best
 from sb3_said.zoo.depths import DepthPlanners
-from sb3_said.zoo.evaluate import evaluate
+from sb3_said.zoo.evaluate import evaluate, print_table
 from sb3_said.zoo.runs import ANSWERS, LoadedRun, load_run, origin
 from sb3_said.zoo.search import describe, find_winner, finished, open_study, returns_of, save_plot, search
 
-EPILOG = """\
+EPILOG = f"""\
 examples:
   # the paper's grid: three planners are trained, each is tried at six temperatures
   sb3-said tune --run logs/said/Hopper-v5-delay4_1
 
-  # the same with two workers, here or on machines that share the folder; run it again to go on after a crash
+  # two workers; they may run on machines that share the folder
   sb3-said tune --run logs/said/Hopper-v5-delay4_1 --num-threads 1 & \\
   sb3-said tune --run logs/said/Hopper-v5-delay4_1 --num-threads 1
 
-  # a quick look: one depth, fewer updates, fewer episodes, into a folder of its own
+  # a quick look: one depth, fewer updates, fewer episodes, in a folder of its own
   sb3-said tune --run logs/said/Hopper-v5-delay4_1 --depths 2 --gradient-steps 5000 --episodes 10 --output look
 
-  # fewer denoising steps are faster, and on some tasks better
-  sb3-said tune --run logs/said/HalfCheetah-v5-delay0-16_1 --depths 2 --temperatures 0 --sampling-steps 1 2 5
+  # any temperature from 0 to 1, fewer denoising steps, in a data base
+  sb3-said tune --run logs/said/Hopper-v5-delay4_1 --sampler tpe --n-trials 30 --sampling-steps 1 2 5 \\
+      --storage sqlite:///tune.db
 
-  # any temperature from 0 to 1, in a data base
-  sb3-said tune --run logs/said/Hopper-v5-delay4_1 --sampler tpe --n-trials 30 --storage sqlite:///tune.db
-
-  # afterwards: train with the winner, or play it
+  # then train with the winner, or play it
   sb3-said train --algo said --env Hopper-v5 --delay 4 -conf logs/said/Hopper-v5-delay4_1/tune/best.yml
   sb3-said evaluate logs/said/Hopper-v5-delay4_1/tune/best.zip
 
-A run is what sb3-said train --algo said left: its expert collects nothing more, its replay trains one planner per
-depth; then trials begin. Every trial plays the same episodes, --seed and up; one that is clearly worse than the best,
-episode by episode, is pruned. The winner, and the expert beside it, are reported on other episodes, --report-seed and
-up, since the best of many trials looks better on its own episodes than it is.
-
-Written to RUN_DIR/tune: planner_depthN.zip, study.log (the study), results.json, best.yml, best.zip and slice.png.
-Each worker reports when it ends; what the last one writes covers all trials.
-A run folder's YAML can run code (rl_zoo3 reads it so): open only folders that you trust.
+The search keeps the run's expert and replay, and trains one planner per depth. Every trial plays the same episodes. A
+trial that is clearly worse than the best, episode by episode, is pruned. The best of many trials looks better on these
+episodes than it is: the report plays the winner and the expert on others.
+Give the same command again to go on after a crash. The output folder holds the planners, study.log (the study),
+results.json, best.yml, best.zip and slice.png; each worker writes the report when it ends.
+{TRUST}
 """
 DEPTHS, TEMPERATURES = [2, 4, 8], [0.0, 0.1, 0.3, 0.6, 0.8, 1.0]
 
@@ -64,23 +61,24 @@ def main(argv: list[str] | None = None) -> None:
     parser = make_parser(__doc__, EPILOG)
     add = parser.add_argument
     add("--run", type=Path, required=True, metavar="RUN_DIR", help="folder that sb3-said train left")
-    add("--depths", type=int, nargs="+", default=DEPTHS, metavar="N", help="default: 2 4 8")
+    add("--depths", type=int, nargs="+", default=DEPTHS, metavar="N", help="network depths (default: 2 4 8)")
     add("--temperatures", type=float, nargs="+", default=TEMPERATURES, metavar="T", help="default: 0 0.1 0.3 0.6 0.8 1")
     add("--sampling-steps", type=int, nargs="+", metavar="N", help="denoising steps (default: as the run's)")
-    add("--sampler", choices=("grid", "tpe"), default="grid", help="default: grid, every cell once")
+    add("--sampler", choices=("grid", "tpe"), default="grid", help="grid tries every cell once; tpe draws temperatures "
+        "between the lowest and the highest (default: grid)")  # fmt: skip
     add("--n-trials", type=int, help="trials of the whole study (default: as many as the grid has)")
     add("--gradient-steps", type=int, help="updates of each planner (default: as the run's)")
-    add("--episodes", type=int, default=20, help="whole episodes of a trial (default: 20)")
-    add("--round", type=int, default=5, help="episodes side by side, between two looks at pruning (default: 5)")
+    add("--episodes", type=int, default=20, help="episodes of a trial (default: 20)")
+    add("--round", type=int, default=5, help="episodes played between two decisions on pruning (default: 5)")
     add("--prune", type=float, default=0.05, metavar="P", help="p-value of the paired test below which a trial is "
         "pruned; 0: never (default: 0.05)")  # fmt: skip
     add("--seed", type=int, default=20_000, help="reset seed of the first episode (default: 20000)")
-    add("--report-episodes", type=int, default=50, help="of the winner and the expert (default: 50)")
-    add("--report-seed", type=int, default=10_000, help="reset seed of the first of those (default: 10000)")
+    add("--report-episodes", type=int, default=50, help="episodes that report the winner and the expert (default: 50)")
+    add("--report-seed", type=int, default=10_000, help="reset seed of the first of them (default: 10000)")
     add("--storage", help="Optuna RDB URL, or path of a journal file (default: study.log in the output folder)")
     add("--study-name", help="default: the run folder's name")
     add("--output", type=Path, metavar="DIR", help="default: RUN_DIR/tune")
-    add("--timeout", type=float, metavar="SECONDS", help="begin no trial after this time")
+    add("--timeout", type=float, default=math.inf, metavar="SECONDS", help="begin no trial after this time")
     add("--device", default="auto", help="torch device (default: auto)")
     add("--num-threads", type=int, help="torch threads (default: torch's own choice)")
     add("-P", "--progress", action="store_true", help="show a progress bar while a planner trains")
@@ -93,8 +91,9 @@ def main(argv: list[str] | None = None) -> None:
 
 
 def check(args: argparse.Namespace) -> None:
-    """
-    :raises ValueError: for options that make no search
+    """Check the options.
+
+    :raises ValueError: naming the option that is wrong
     """
     check_positive(args, "episodes", "round", "report_episodes", "n_trials", "gradient_steps")
     if not 0 <= args.prune < 1:
@@ -125,10 +124,11 @@ def tune(args: argparse.Namespace) -> None:
     tried = {"depth": args.depths, "temperature": args.temperatures, "sampling_steps": steps}
     for name, values in tried.items():
         for value in values:
-            replace(planners.config, **{name: value})  # refuses what is no setting
+            replace(planners.config, **{name: value})  # raises for a value out of range
     common = {"sampler": args.sampler, "episodes": args.episodes, "seed": args.seed}
     common |= {"env": run.info["env"], "delay": run.info["delay"]}
-    common |= {key: value for key, value in planners.settings(planners.config.depth).items() if key not in tried}
+    common |= {**planners.config.to_dict(), **planners.training(planners.config.depth)}
+    common = {key: value for key, value in common.items() if key not in tried}
     if args.sampler == "tpe":
         common |= {**tried, "temperature": [min(args.temperatures), max(args.temperatures)]}
     storage, name = args.storage or str(folder / "study.log"), args.study_name or args.run.resolve().name
@@ -141,7 +141,7 @@ def tune(args: argparse.Namespace) -> None:
         return [float(value) for value in run.play(n, seed, n).returns]
 
     planners.train(args.depths)
-    left = None if args.timeout is None else max(args.timeout - (time.monotonic() - began), 0.0)
+    left = args.timeout - (time.monotonic() - began)
     how = (args.sampler, args.n_trials, args.episodes, args.round, args.seed, left)
     search(study, tried, planners.put, play, *how)
     winner = find_winner(study)
@@ -160,7 +160,7 @@ def open_run(args: argparse.Namespace) -> tuple[LoadedRun, SAID]:
     run = load_run(args.run, device=args.device)
     if not isinstance(run.model, SAID):
         raise ValueError(f"{args.run} is a run of '{run.info['algo']}', which has no planner; give one of --algo said.")
-    if not args.run.is_dir() or not (args.run / CHECKPOINT_NAME).is_file():
+    if not (args.run / CHECKPOINT_NAME).is_file():
         raise ValueError(
             f"{args.run} has no {CHECKPOINT_NAME}, whose replay the planners are trained on; give the folder that the "
             "training left, and finish the run if it was stopped: sb3-said train --resume RUN_DIR"
@@ -171,7 +171,7 @@ def open_run(args: argparse.Namespace) -> tuple[LoadedRun, SAID]:
 
 
 def report(args: argparse.Namespace, run: LoadedRun, study: Study, winner: FrozenTrial, folder: Path) -> None:
-    """Play the winner, which the agent has, and the expert on fresh episodes; write everything that was found."""
+    """Play the winner, which the agent has, and the expert on fresh episodes; write the files and print a summary."""
     results = folder / "results.json"
     fresh = {"study": study.study_name, "trial": winner.number, "finished": str(winner.datetime_complete)}
     fresh |= {"seed": args.report_seed, "n_episodes": args.report_episodes}
@@ -182,16 +182,14 @@ def report(args: argparse.Namespace, run: LoadedRun, study: Study, winner: Froze
         how = (args.report_episodes, args.report_seed)
         played = [evaluate(run, answer, *how, latency_calls=100).to_dict() for answer in ANSWERS]
     run.model.save(folder / "best.zip")
-    trials = [trial_to_dict(trial, args.seed) for trial in finished(study)]
-    choice = (
-        f"trial {winner.number} of {len(trials)} in study {study.study_name!r}, mean return {winner.value:.1f} over "
-    )
-    command = write_best(args.run, folder, dict(winner.params), f"{choice}{args.episodes} episodes")
+    trials = [trial_to_dict(trial) for trial in finished(study)]
+    choice = f"the best of {len(trials)} trials, mean return {winner.value:.1f} over {args.episodes} episodes"
+    command = write_best(args.run, folder, winner.params, choice)
     document = {
         **run.info,
         "settings": study.user_attrs["settings"],
         "trials": trials,
-        "winner": {**trial_to_dict(winner, args.seed), "agent": str(folder / "best.zip")},
+        "winner": {**trial_to_dict(winner), "agent": str(folder / "best.zip")},
         "report": {**fresh, "deterministic": True, "results": played},
         "origin": origin(run),
     }
@@ -201,10 +199,9 @@ def report(args: argparse.Namespace, run: LoadedRun, study: Study, winner: Froze
     print(f"\n{len(trials)} trials, {pruned} of them pruned. Best: {describe(winner.params)}, mean return "
           f"{winner.value:,.1f} on the episodes it was chosen by.")  # fmt: skip
     print(f"On {args.report_episodes} other episodes:")
-    for one in played:
-        mean = one["mean_return"]
-        interval = "" if mean["low"] is None else f"   95 % interval [{mean['low']:,.1f}, {mean['high']:,.1f}]"
-        print(f"  {one['label']:8} {mean['value']:12,.1f}{interval}")
+    print_table(
+        [Summary.from_episodes(p["label"], p["returns"], p["lengths"], Latency(**p["latency"])) for p in played]
+    )
     if find_spec("matplotlib") is None:
         print('No plot: it needs matplotlib, pip install "sb3_said[plots]"')
     else:
@@ -212,17 +209,14 @@ def report(args: argparse.Namespace, run: LoadedRun, study: Study, winner: Froze
     print(f"Wrote results.json, best.yml and best.zip in {folder}\nTrain with it: {command}")
 
 
-def trial_to_dict(trial: FrozenTrial, seed: int) -> dict[str, Any]:
+def trial_to_dict(trial: FrozenTrial) -> dict[str, Any]:
     """Return what results.json keeps of a trial."""
     returns = returns_of(trial)
-    interval = bootstrap_interval(returns)
     return {
         "number": trial.number,
         "state": trial.state.name,
         **trial.params,
-        "mean_return": interval.value,
-        "interval": None if len(returns) < 2 else [interval.low, interval.high],
-        "seed": seed,
+        "mean_return": sum(returns) / len(returns),
         "n_episodes": len(returns),
         "returns": returns,
         "seconds": None if trial.duration is None else trial.duration.total_seconds(),
