@@ -2,15 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch as th
-
-
-def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
-    """:raises ValueError: for a name that is not among the choices"""
-    if value not in choices:
-        raise ValueError(f"{name} is {value!r}, expected one of {tuple(choices)}.")
 
 
 def check_shape(name: str, values: th.Tensor, shape: tuple[int | None, ...]) -> None:

@@ -149,17 +149,15 @@ class InpaintingPlanner(nn.Module):
         # are those behind the horizon, so that a decision at a small delay can do without them
         state_known = None
         if config.extra_state_probability > 0:
-            state_known = inpainting.draw_known_states(
-                n, self.max_delay, config.extra_state_probability, generator, device
-            )
+            state_known = inpainting.draw_known_states(n, self.max_delay, config.extra_state_probability, generator)
+            state_known = state_known.to(device)
         known = inpainting.known_mask(delay, self.window_length, self.obs_dim, self.act_dim, state_known)
         known = known & valid[..., None]
         noise = self._noise(clean.shape, generator)
-        t = diffusion.draw_times(
-            n, config.schedule, config.time_sampling, config.end_time_probability, generator, device
-        )
+        t = diffusion.draw_times(n, config.schedule, config.time_sampling, config.end_time_probability, generator)
+        t = t.to(device)
         alpha, sigma = (factor[:, None, None] for factor in diffusion.alpha_sigma(t, config.schedule))
-        x = th.where(known, clean, diffusion.add_noise(clean, noise, alpha, sigma))
+        x = th.where(known, clean, alpha * clean + sigma * noise)
         network = self.network
         with autocast(config.precision, device):
             output = network(x, network.context(clean, known), network.modulations(t), valid)

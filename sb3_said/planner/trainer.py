@@ -9,13 +9,14 @@ from dataclasses import replace
 from typing import Any
 
 import torch as th
+import torch.nn.functional as F
 
 from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.graphs import RecordedFunction
 from sb3_said.planner.inpainting import draw_delays
 from sb3_said.planner.planner import InpaintingPlanner
 from sb3_said.planner.values import scaled_values, window_weight
-from sb3_said.planner.yardstick import Present, RegressionYardstick
+from sb3_said.planner.yardstick import RegressionYardstick
 from sb3_said.replay.windows import Windows, WindowSource
 
 HELD_OUT_WINDOWS = 1024  # per delay, in evaluate(): tells errors that differ by 2 % apart
@@ -171,7 +172,7 @@ class PlannerTrainer:
         self.yardstick_optimizer.zero_grad()
         windows = self.source.sample(config.batch_size, self.planner.window_length, self.generator)
         mask = config.mask, config.mask_end_probability
-        delay = draw_delays(config.batch_size, self.planner.max_delay, *mask, self.generator, self.device)  # (B,)
+        delay = draw_delays(config.batch_size, self.planner.max_delay, *mask, self.generator).to(self.device)  # (B,)
         weight = window_weight(windows.values, config.weight_factor)  # (B,)
         loss = self.online.loss(windows, delay, weight, self.generator)
         loss.backward()
@@ -179,7 +180,8 @@ class PlannerTrainer:
             th.nn.utils.clip_grad_norm_(self._online, config.gradient_clip)
         self.optimizer.step()
 
-        yardstick_loss = self.yardstick.loss(*self._yardstick_batch(windows, delay), weight)
+        windows = windows._replace(states=self.planner.normalizer.normalize_states(windows.states))
+        yardstick_loss = self.yardstick.loss(windows, delay, weight)
         yardstick_loss.backward()
         self.yardstick_optimizer.step()
         return (th.stack((loss, yardstick_loss)).detach(),)
@@ -217,19 +219,19 @@ class PlannerTrainer:
         regression's. The planner decodes with its averaged weights, one candidate and temperature 0.
         """
         self._check_finite()
-        metrics = {}
+        metrics, normalize = {}, self.planner.normalizer.normalize_states
         for d, windows in self._held_out.items():
-            delay = th.full((len(windows.states),), d, device=self.device)
-            observed, actions, _, truth, _ = self._yardstick_batch(windows, delay)
-            guess = self.yardstick(observed, actions, delay)
-            history = self._action_history(windows.actions, delay)
-            plan = self.planner.plan(windows.states[:, 0], history, delay, temperature=0.0)
-            for name, present in (
-                ("", Present(self.planner.normalizer.normalize_states(plan.present), plan.action)),
-                ("_mlp", Present(guess.state, guess.action.clamp(-1.0, 1.0))),
+            states, actions = windows.states, windows.actions
+            delay = th.full((len(states),), d, device=self.device)
+            history = F.pad(actions[:, :d], (0, 0, self.planner.max_delay - d, 0))  # (B, D, act_dim), as an agent has
+            plan = self.planner.plan(states[:, 0], history, delay, temperature=0.0)
+            present, decision = self.yardstick(normalize(states[:, 0]), actions, delay)
+            for name, state, action in (
+                ("", normalize(plan.present), plan.action),
+                ("_mlp", present, decision.clamp(-1.0, 1.0)),
             ):
-                metrics[f"planner/present_error{name}_d{d}"] = (present.state - truth.state).abs().mean().item()
-                metrics[f"planner/action_error{name}_d{d}"] = (present.action - truth.action).abs().mean().item()
+                metrics[f"planner/present_error{name}_d{d}"] = (state - normalize(states[:, d])).abs().mean().item()
+                metrics[f"planner/action_error{name}_d{d}"] = (action - actions[:, d]).abs().mean().item()
         return metrics
 
     def state_dict(self) -> dict[str, Any]:
@@ -300,21 +302,6 @@ class PlannerTrainer:
                 f"infinite values; else lower learning_rate ({self.config.learning_rate}) or lengthen warmup_steps "
                 f"({self.config.warmup_steps})."
             )
-
-    def _yardstick_batch(
-        self, windows: Windows, delay: th.Tensor
-    ) -> tuple[th.Tensor, th.Tensor, th.Tensor, Present, th.Tensor]:
-        index = th.arange(len(delay), device=self.device)
-        states = self.planner.normalizer.normalize_states(windows.states)  # (B, L, obs_dim)
-        present = Present(states[index, delay], windows.actions[index, delay])
-        return states[:, 0], windows.actions, delay, present, windows.valid[index, delay]
-
-    def _action_history(self, actions: th.Tensor, delay: th.Tensor) -> th.Tensor:
-        """Return what an agent would hold: (B, D, act_dim) with the d known actions last."""
-        D = self.planner.max_delay
-        source = th.arange(D, device=self.device) - (D - delay[:, None])  # (B, D): the window's index, < 0 if before it
-        history = actions.gather(1, source.clamp_min(0)[..., None].expand(-1, -1, actions.shape[-1]))
-        return history * (source >= 0)[..., None]
 
     def _draw_held_out(self, source: WindowSource, seed: int) -> dict[int, Windows]:
         """Return windows of every delay that the planner is trained for; a delay longer than all episodes has none."""
