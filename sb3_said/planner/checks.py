@@ -5,23 +5,30 @@ from __future__ import annotations
 import torch as th
 
 
-def check_shape(name: str, values: th.Tensor, shape: tuple[int | None, ...]) -> None:
-    """:raises ValueError: for another shape, where ``None`` stands for any size, or no rows"""
-    fits = len(values.shape) == len(shape) and all(
-        want in (None, have) for have, want in zip(values.shape, shape, strict=True)
-    )
-    if not fits:
+def float_tensor(name: str, values: th.Tensor, shape: tuple[int | None, ...], device: th.device) -> th.Tensor:
+    """Return values in float32 on a device.
+
+    :raises ValueError: for another shape, where ``None`` stands for any size, or no rows
+    """
+    values = th.as_tensor(values, dtype=th.float32, device=device)
+    fits = values.dim() == len(shape)
+    if not fits or any(want not in (None, have) for have, want in zip(values.shape, shape, strict=True)):
         expected = ", ".join("any" if want is None else str(want) for want in shape)
         raise ValueError(f"{name} has the shape {tuple(values.shape)}, expected ({expected}).")
     if len(values) == 0:
         raise ValueError(f"{name} is empty, expected at least one row.")
+    return values
 
 
-def check_finite(name: str, values: th.Tensor, shape: tuple[int | None, ...]) -> None:
-    """:raises ValueError: as :func:`check_shape`, and for numbers that are not finite"""
-    check_shape(name, values, shape)
+def finite_tensor(name: str, values: th.Tensor, shape: tuple[int | None, ...], device: th.device) -> th.Tensor:
+    """Return values as :func:`float_tensor` does.
+
+    :raises ValueError: as there, and for numbers that are not finite
+    """
+    values = float_tensor(name, values, shape, device)
     if not values.isfinite().all():
         raise ValueError(f"{name} has entries that are NaN or infinite; find out where they come from first.")
+    return values
 
 
 def checked_delay(delay: th.Tensor, batch_size: int, max_delay: int) -> th.Tensor:

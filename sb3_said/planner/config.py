@@ -106,11 +106,11 @@ class PlannerConfig:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected a number in [0, 1].")
 
     def to_dict(self) -> dict[str, Any]:
-        """Return every setting in JSON types, as it comes back from a file: a tuple is a list."""
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
+        """Return every setting in JSON types, as it comes back from a file."""
+        return {**asdict(self), "betas": list(self.betas)}
 
     def weight_settings(self) -> dict[str, Any]:
-        """Return the settings that decide a training's weights: all but those of sampling, in JSON types."""
+        """Return the settings that decide a training's weights, in JSON types: all but those of sampling."""
         return {name: value for name, value in self.to_dict().items() if name not in SAMPLING_SETTINGS}
 
     @classmethod

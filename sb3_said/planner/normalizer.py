@@ -40,7 +40,7 @@ class Normalizer(nn.Module):
         relative_states: bool = False,
     ) -> None:
         super().__init__()
-        self.obs_dim, self.act_dim = obs_dim, act_dim
+        self.sizes = [obs_dim, act_dim]
         self.relative_states = relative_states
         self.register_buffer("move_std", th.ones(window_length - 1, obs_dim))
         self.action_transform = action_transform
@@ -82,7 +82,7 @@ class Normalizer(nn.Module):
 
     def denormalize(self, x: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Invert :meth:`normalize`: states and actions, the latter in [-1, 1] whatever is given."""
-        z, actions = x.split([self.obs_dim, self.act_dim], dim=-1)
+        z, actions = x.split(self.sizes, dim=-1)
         if self.relative_states:
             first = z[..., :1, :]
             z = th.cat([first, first + z[..., 1:, :] * self.move_std[: z.shape[-2] - 1]], dim=-2)

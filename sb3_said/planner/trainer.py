@@ -134,6 +134,9 @@ class PlannerTrainer:
         self.yardstick_optimizer = th.optim.Adam(
             self.yardstick.parameters(), lr=self._rate(YARDSTICK_LEARNING_RATE), **fused
         )
+        self._modules: dict[str, th.nn.Module]
+        self._modules = {"planner": planner, "online": self.online, "yardstick": self.yardstick}
+        self._optimizers = {"optimizer": self.optimizer, "yardstick_optimizer": self.yardstick_optimizer}
         self._averaged: list[th.Tensor] = list(planner.parameters())
         self._online: list[th.Tensor] = list(self.online.parameters())
         # Read at log times only: a read per update would make a GPU wait for it.
@@ -241,9 +244,9 @@ class PlannerTrainer:
             {
                 "settings": self._settings,
                 "n_updates": self.n_updates,
-                **{name: dict(module.state_dict()) for name, module in self._modules().items()},
+                **{name: dict(module.state_dict()) for name, module in self._modules.items()},
                 # Of optimizers the state alone: their groups hold nothing but settings
-                **{name: optimizer.state_dict()["state"] for name, optimizer in self._optimizers().items()},
+                **{name: optimizer.state_dict()["state"] for name, optimizer in self._optimizers.items()},
                 "generator": self.generator.get_state(),
                 "loss_sums": self._loss_sums,
                 "n_losses": self._n_losses,
@@ -265,9 +268,9 @@ class PlannerTrainer:
             )
         state = copy.deepcopy(state)
         self.n_updates = state["n_updates"]
-        for name, module in self._modules().items():
+        for name, module in self._modules.items():
             module.load_state_dict(state[name])
-        for name, optimizer in self._optimizers().items():
+        for name, optimizer in self._optimizers.items():
             optimizer.load_state_dict({**optimizer.state_dict(), "state": state[name]})
         self.generator.set_state(state["generator"].cpu())
         self._loss_sums.copy_(state["loss_sums"])
@@ -275,12 +278,6 @@ class PlannerTrainer:
         self._bad_update.fill_(-1)
         if self._recorded is not None:
             self._recorded.forget()  # it writes to the optimizer state that was replaced
-
-    def _modules(self) -> dict[str, th.nn.Module]:
-        return {"planner": self.planner, "online": self.online, "yardstick": self.yardstick}
-
-    def _optimizers(self) -> dict[str, th.optim.Optimizer]:
-        return {"optimizer": self.optimizer, "yardstick_optimizer": self.yardstick_optimizer}
 
     def _rate(self, rate: float) -> float | th.Tensor:
         """Return a learning rate as the optimizers take it: on a GPU a tensor, so that a recorded update reads it."""
