@@ -16,7 +16,7 @@ from sb3_said.planner.dit import DiT1d
 from sb3_said.planner.graphs import RecordedFunction
 from sb3_said.planner.normalizer import Normalizer
 from sb3_said.planner.precision import autocast
-from sb3_said.planner.selection import ValueFn, choose, mean_value, value_of
+from sb3_said.planner.selection import ValueFn, choose, score
 from sb3_said.replay.windows import Windows
 
 MAX_GRAPHS = 8  # of a GPU; each keeps the memory of one decision
@@ -279,7 +279,7 @@ class InpaintingPlanner(nn.Module):
     ) -> Plan:
         """Go from what is known and initial noise to the decision, and never wait for the device on the way.
 
-        :param shortest: a lower bound of the delays; no earlier state is valued for ``scored_states="future"``
+        :param shortest: a lower bound of the delays
         :param is_mixed: whether delays may differ, so that some windows end before others
         :param times: (n_steps,) of the steps
         :param x: (B, N, L, obs_dim + act_dim) initial noise, scaled
@@ -309,17 +309,12 @@ class InpaintingPlanner(nn.Module):
         states, actions = x.split(self.sizes, dim=-1)
         rows = th.arange(len(x), device=x.device)
         present = states[rows, :, delay].mean(1)  # (B, obs_dim)
-        decisions = actions[rows, :, delay]  # (B, N, act_dim)
         if value_fn is None:
             values = th.zeros(x.shape[:2], device=x.device)
-        elif self.config.scored_states == "decision":
-            shared = present[:, None].expand(-1, x.shape[1], -1)  # (B, N, obs_dim)
-            values = value_of(value_fn, shared[:, :, None], decisions[:, :, None])[..., 0]
         else:
-            known_until, skipped = (delay, shortest) if self.config.scored_states == "future" else (0 * delay, 0)
-            end = delay + self.config.horizon
-            values = mean_value(value_fn, states, actions, known_until + 1, end, skipped + 1)
-        return Plan(choose(decisions, values, self.config.choice_factor), present, states, actions, values)
+            values = score(value_fn, self.config, states, actions, delay, shortest)
+        action = choose(actions[rows, :, delay], values, self.config.choice_factor)
+        return Plan(action, present, states, actions, values)
 
     def _within(self, delay: th.Tensor, length: int) -> th.Tensor:
         """Tell which steps a window of each delay has, d + horizon of them: (B, L) bool."""
