@@ -48,3 +48,21 @@ def checked_delay(delay: th.Tensor, batch_size: int, max_delay: int) -> th.Tenso
             "with a larger max_delay."
         )
     return delay.to(th.int64)
+
+
+def checked_extra_states(
+    history: th.Tensor | None, known: th.Tensor | None, shape: tuple[int, int, int], device: th.device
+) -> tuple[th.Tensor, th.Tensor]:
+    """Return extra states and which of them are known: (B, D, obs_dim) float32 and (B, D) bool.
+
+    :raises ValueError: for only one of the two, another shape than (B, D, obs_dim), or entries that mean nothing
+    """
+    if history is None and known is None:  # zeros, so that a recorded graph always has these inputs
+        return th.zeros(shape, device=device), th.zeros(shape[:2], dtype=th.bool, device=device)
+    if history is None or known is None:
+        raise ValueError("Only one of state_history and state_known is given; give both or neither.")
+    history = finite_tensor("state_history", history, shape, device)
+    known = finite_tensor("state_known", known, shape[:2], device)
+    if not ((known == 0) | (known == 1)).all():
+        raise ValueError("state_known has entries other than 0 and 1, expected 1 where a state is known.")
+    return history, known.bool()

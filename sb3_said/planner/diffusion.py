@@ -94,12 +94,11 @@ def solver_steps(schedule: str, n_steps: int) -> tuple[SolverStep, ...]:
     if n_steps < 1:
         raise ValueError(f"The number of solver steps is {n_steps}, expected at least 1.")
     times = th.linspace(END_TIMES[schedule], START_TIME, n_steps + 1, dtype=th.float64)
-    alphas, sigmas = (values.tolist() for values in alpha_sigma(times, schedule))
-    steps = []
-    for i, t in enumerate(times[:-1].tolist()):
-        keep = sigmas[i + 1] / sigmas[i]
-        steps.append(SolverStep(t, alphas[i], sigmas[i], keep, alphas[i + 1] - alphas[i] * keep))
-    return tuple(steps)
+    alpha, sigma = alpha_sigma(times, schedule)  # (n_steps + 1,)
+    keep = sigma[1:] / sigma[:-1]
+    clean = alpha[1:] - alpha[:-1] * keep
+    rows = th.stack((times[:-1], alpha[:-1], sigma[:-1], keep, clean), dim=1)
+    return tuple(SolverStep(*row) for row in rows.tolist())
 
 
 def solve(

@@ -78,12 +78,9 @@ class DiT1d(nn.Module):
     A call has three parts, because two of them do not change from one denoising step or candidate to the next:
     :meth:`modulations` depends on the time alone, :meth:`context` on what is known alone, :meth:`forward` on both.
 
-    :param obs_dim: numbers in a state
-    :param act_dim: numbers in an action
     :param max_delay: D, the most actions that can be known
     :param length: steps of the longest window
     :param d_model: width, a multiple of 32
-    :param depth: number of blocks
     :param embed_known: add an embedding of the whole known part to every token, beside showing it in its place
     :param extra_states: states at indices 1..D may be known too, and are embedded
     """

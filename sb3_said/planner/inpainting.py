@@ -1,8 +1,7 @@
 """What of a window is known: the delayed observation and the actions sent since (the paper's section on SAID).
 
 Observations that arrive late or out of order are known too: any of the states s_{t-D+1..t}. Those younger than s_{t-d}
-lie at indices 1..d of the window. Older ones lie before it, and are dropped: by the Markov property they say nothing
-about what follows s_{t-d} that it does not say itself.
+lie at indices 1..d of the window. Older ones are dropped: given s_{t-d}, they add nothing (Markov property).
 """
 
 from __future__ import annotations
@@ -93,8 +92,7 @@ def draw_known_states(
 ) -> th.Tensor:
     """Draw which of the states s_{t-D+1..t} a training batch shows, on the generator's device: (B, D) bool.
 
-    In a window that shows any, each is known with a probability of the window's own, uniform in [0, 1]: then any number
-    of them is as likely as any other.
+    A window that shows any draws its own share of known states, uniform in [0, 1]: every number of them is as likely.
 
     :param probability: of a window to show any
     """

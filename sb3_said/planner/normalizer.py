@@ -14,11 +14,8 @@ class Normalizer(nn.Module):
     """Z-score states and actions; its statistics are buffers, so they are saved with the planner.
 
     With ``relative_states`` a window holds, behind its first state, how far each state has moved from there, in
-    standard deviations of such moves at that index. States a few steps apart differ by little, and errors count in
-    that little.
+    standard deviations of such moves at that index: states a few steps apart differ by little, and that little counts.
 
-    :param obs_dim: numbers in a state
-    :param act_dim: numbers in an action
     :param window_length: L, steps of a window
     :param relative_states: see above; False z-scores every state alike (paper)
     :param action_transform: ``"standard"``: z-score actions as they are, and clip them on the way back; ``"tanh"`` (the

@@ -10,7 +10,7 @@ import torch as th
 from torch import nn
 
 from sb3_said.planner import diffusion, inpainting
-from sb3_said.planner.checks import checked_delay, finite_tensor, float_tensor
+from sb3_said.planner.checks import checked_delay, checked_extra_states, finite_tensor, float_tensor
 from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.dit import DiT1d
 from sb3_said.planner.graphs import RecordedFunction
@@ -215,13 +215,21 @@ class InpaintingPlanner(nn.Module):
         n = len(observation)
         action_history = finite_tensor("action_history", action_history, (n, self.max_delay, self.act_dim), device)
         delay = self._trained_delay(checked_delay(delay, n, self.max_delay).to(device), action_history)
-        extra_states = self._extra_states(state_history, state_known, n)
+        extra_states: tuple[th.Tensor, ...] = ()
+        if config.extra_state_probability > 0:
+            shape = (n, self.max_delay, self.obs_dim)
+            extra_states = checked_extra_states(state_history, state_known, shape, device)
+        elif state_history is not None or state_known is not None:
+            raise ValueError(
+                "This planner is not trained with extra known states; build and train it with "
+                "PlannerConfig(extra_state_probability=0.5), or leave state_history and state_known out."
+            )
         shortest, longest = int(delay.min()), int(delay.max())
         length = longest + config.horizon  # a decision costs what its age costs
         temperature = config.temperature if temperature is None else temperature
-        shape = (length, self.obs_dim + self.act_dim)
+        window = (length, self.obs_dim + self.act_dim)
         if noise is not None:
-            noise = finite_tensor("noise", noise, (n_candidates, self.window_length, shape[1]), device)
+            noise = finite_tensor("noise", noise, (n_candidates, self.window_length, window[1]), device)
             n_candidates, noise = len(noise), noise[:, :length]
         elif n_candidates is None:
             n_candidates = 1 if value_fn is None else config.n_candidates
@@ -233,9 +241,9 @@ class InpaintingPlanner(nn.Module):
         steps = diffusion.solver_steps(config.schedule, n_steps)
 
         if temperature == 0:
-            x = th.zeros(n, 1, *shape, device=device)
+            x = th.zeros(n, 1, *window, device=device)
         else:
-            noise = self._noise((n, n_candidates, *shape), generator) if noise is None else noise
+            noise = self._noise((n, n_candidates, *window), generator) if noise is None else noise
             x = temperature * noise.expand(n, -1, -1, -1)  # (B, N, L, obs_dim + act_dim)
         times = th.tensor([step.t for step in steps], device=device)
         inputs = (times, observation, action_history, delay, x, *extra_states)
@@ -335,28 +343,6 @@ class InpaintingPlanner(nn.Module):
         amid = (action_history.ne(0).any(-1) & older).any(1)  # (B,): acted on longer ago than the observation is old
         self.check_ages(delay[amid].tolist())
         return th.full_like(delay, self.max_delay)
-
-    def _extra_states(
-        self, state_history: th.Tensor | None, state_known: th.Tensor | None, batch_size: int
-    ) -> tuple[th.Tensor, ...]:
-        """Return checked extra states, (B, D, obs_dim) and (B, D) bool, or nothing if the config has none."""
-        if (state_history is None) != (state_known is None):
-            raise ValueError("Only one of state_history and state_known is given; give both or neither.")
-        if self.config.extra_state_probability == 0:
-            if state_history is not None:
-                raise ValueError(
-                    "This planner is not trained with extra known states; build and train it with "
-                    "PlannerConfig(extra_state_probability=0.5), or leave state_history and state_known out."
-                )
-            return ()
-        shape = (batch_size, self.max_delay)
-        if state_history is None or state_known is None:  # zeros, so that a recorded graph always has these inputs
-            state_history, state_known = th.zeros(*shape, self.obs_dim), th.zeros(shape)
-        state_history = finite_tensor("state_history", state_history, (*shape, self.obs_dim), self.device)
-        state_known = finite_tensor("state_known", state_known, shape, self.device)
-        if not ((state_known == 0) | (state_known == 1)).all():
-            raise ValueError("state_known has entries other than 0 and 1, expected 1 where a state is known.")
-        return state_history, state_known.bool()
 
 
 def _owner(value_fn: ValueFn) -> object:

@@ -1,4 +1,4 @@
-"""In which number format networks compute."""
+"""The number format in which networks compute."""
 
 from __future__ import annotations
 

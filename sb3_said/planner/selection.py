@@ -1,4 +1,4 @@
-"""Monte-Carlo sampling with selection (MCSS): what candidates are worth, and which decision that makes."""
+"""Monte-Carlo sampling with selection (MCSS): score the candidates, and choose the decision."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _value_of(value_fn: ValueFn, states: th.Tensor, actions: th.Tensor) -> th.Te
 def choose(actions: th.Tensor, values: th.Tensor, factor: float | None) -> th.Tensor:
     """Return one action of N: the most valuable, or the mean weighed by exp(factor * z), z the standardised values.
 
-    Where the present is uncertain, the most valuable of many is mostly a lucky one, and acting on luck is jittery.
+    Where the present is uncertain, the most valuable of many candidates mostly owes its value to luck.
 
     :param actions: (B, N, act_dim)
     :param values: (B, N)

@@ -37,8 +37,7 @@ def learning_rate(step: int, gradient_steps: int, config: PlannerConfig) -> floa
 def ema_decay(step: int, config: PlannerConfig) -> float:
     """Return the decay of the averaged weights after update ``step`` = 0, 1, ...
 
-    With ``ema_warmup`` it rises to its full value, because a full-length average still holds mostly initial weights in
-    a short run.
+    With ``ema_warmup`` it rises to its full value: in a short run, a full-length average is mostly initial weights.
     """
     if not config.ema_warmup:
         return config.ema_decay
@@ -46,11 +45,10 @@ def ema_decay(step: int, config: PlannerConfig) -> float:
 
 
 def worse_than_regression(errors: dict[str, float], tolerance: float = 0.05) -> str:
-    """Name what a planner should not be left with: errors above those of the regression beside it.
+    """Name the errors that lie above those of the regression, such as ``"present_error_d4 0.31 against 0.20"``.
 
     :param errors: of :meth:`PlannerTrainer.evaluate`
     :param tolerance: part by which an error may lie above, for windows are few
-    :return: such as ``"present_error_d4 0.31 against 0.20"``, empty where none is worse
     """
     bars = {name.replace("_mlp", ""): bar for name, bar in errors.items() if "_mlp" in name}
     return ", ".join(
@@ -63,15 +61,13 @@ def worse_than_regression(errors: dict[str, float], tolerance: float = 0.05) -> 
 class PlannerTrainer:
     """Train a planner on windows of states and actions.
 
-    The weights that gradient steps move belong to the trainer (``online``). The planner handed in holds their
-    exponential moving average after every update, so it can be used, saved and evaluated between any two of them.
+    Gradient steps move the trainer's own weights (``online``). After every update the planner handed in holds their
+    exponential moving average, ready to be used, saved and evaluated. A small regression learns from the same batches,
+    as the bar for the planner's errors.
 
-    All draws come from a generator of the trainer's own, and on the CPU a run that was saved and resumed ends bit for
-    bit as if it had never stopped (a GPU's sums do not repeat themselves exactly). A small regression is trained on
-    the same batches, as the bar for the planner's errors.
-
-    On a GPU the data is copied there once, the draws are made there, and from the fourth update on a whole update is
-    one recorded graph. No update waits for the device; losses are read at log times.
+    All draws come from the trainer's own generator. On the CPU a resumed run ends bit for bit as if it had never
+    stopped; a GPU's sums do not repeat themselves exactly. A GPU holds the data, makes the draws, and runs each update
+    from the fourth on as one recorded graph. No update waits for it; losses are read at log times.
 
     :param planner: trained in place; its normaliser is fitted to the training part of ``source``
     :param source: windows of the true, undelayed states and the actions
@@ -134,7 +130,6 @@ class PlannerTrainer:
         self.yardstick_optimizer = th.optim.Adam(
             self.yardstick.parameters(), lr=self._rate(YARDSTICK_LEARNING_RATE), **fused
         )
-        self._modules: dict[str, th.nn.Module]
         self._modules = {"planner": planner, "online": self.online, "yardstick": self.yardstick}
         self._optimizers = {"optimizer": self.optimizer, "yardstick_optimizer": self.yardstick_optimizer}
         self._averaged: list[th.Tensor] = list(planner.parameters())
@@ -152,8 +147,10 @@ class PlannerTrainer:
         :raises FloatingPointError: when a loss was not finite (looked at every 100 updates)
         """
         rate = learning_rate(self.n_updates, self.gradient_steps, self.config)
-        self._set_rate(self.optimizer, rate)
-        self._set_rate(self.yardstick_optimizer, rate * YARDSTICK_LEARNING_RATE / self.config.learning_rate)
+        yardstick_rate = rate * YARDSTICK_LEARNING_RATE / self.config.learning_rate
+        for optimizer, new in ((self.optimizer, rate), (self.yardstick_optimizer, yardstick_rate)):
+            (group,) = optimizer.param_groups
+            group["lr"] = group["lr"].fill_(new) if isinstance(group["lr"], th.Tensor) else new
         (losses,) = self._descend() if self._recorded is None else self._recorded()  # (2,)
         with th.no_grad():  # not recorded: the decay changes from update to update
             th._foreach_lerp_(self._averaged, self._online, 1.0 - ema_decay(self.n_updates, self.config))
@@ -166,13 +163,10 @@ class PlannerTrainer:
             self._check_finite()
 
     def _descend(self) -> tuple[th.Tensor]:
-        """Draw a batch and move the online weights and the yardstick's, reading no number off the device.
-
-        :return: one tensor (2,) float32, the planner's loss and the yardstick's
-        """
+        """Draw a batch, move both sets of weights, and return both losses, (2,), without waiting for the device."""
         config = self.config
-        self.optimizer.zero_grad()
-        self.yardstick_optimizer.zero_grad()
+        for optimizer in self._optimizers.values():
+            optimizer.zero_grad()
         windows = self.source.sample(config.batch_size, self.planner.window_length, self.generator)
         mask = config.mask, config.mask_end_probability
         delay = draw_delays(config.batch_size, self.planner.max_delay, *mask, self.generator).to(self.device)  # (B,)
@@ -282,14 +276,6 @@ class PlannerTrainer:
     def _rate(self, rate: float) -> float | th.Tensor:
         """Return a learning rate as the optimizers take it: on a GPU a tensor, so that a recorded update reads it."""
         return th.tensor(rate, device=self.device) if self.device.type == "cuda" else rate
-
-    @staticmethod
-    def _set_rate(optimizer: th.optim.Optimizer, rate: float) -> None:
-        for group in optimizer.param_groups:
-            if isinstance(group["lr"], th.Tensor):
-                group["lr"].fill_(rate)
-            else:
-                group["lr"] = rate
 
     def _check_finite(self) -> None:
         bad = int(self._bad_update)

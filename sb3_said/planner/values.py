@@ -1,4 +1,4 @@
-"""What a training window weighs: the return to go of its first state, on a scale from 0 to 1, in an exponential."""
+"""The weight of a training window: an exponential of the scaled return to go of its first state."""
 
 from __future__ import annotations
 

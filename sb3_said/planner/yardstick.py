@@ -12,11 +12,9 @@ from sb3_said.replay.windows import Windows
 class RegressionYardstick(nn.Module):
     """Multi-layer perceptron from (s_{t-d}, the d actions since, d) to (s_t, a_t).
 
-    A generative planner has to know the present at least as well as this small network does. One that does not is not
-    trained enough, or wrong, whatever its return says.
+    A generative planner should know the present at least as well as this small network. One that does not is trained
+    too little, or wrong, whatever its return.
 
-    :param obs_dim: size of an observation
-    :param act_dim: size of an action
     :param max_delay: D, the largest delay
     :param hidden: width of the two hidden layers
     """
