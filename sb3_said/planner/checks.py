@@ -2,34 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch as th
 
 
-def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
-    """:raises ValueError: for a name that is not among the choices"""
-    if value not in choices:
-        raise ValueError(f"{name} is {value!r}, expected one of {tuple(choices)}.")
+def float_tensor(name: str, values: th.Tensor, shape: tuple[int | None, ...], device: th.device) -> th.Tensor:
+    """Return values in float32 on a device.
 
-
-def check_shape(name: str, values: th.Tensor, shape: tuple[int | None, ...]) -> None:
-    """:raises ValueError: for another shape, where ``None`` stands for any size, or no rows"""
-    fits = len(values.shape) == len(shape) and all(
-        want in (None, have) for have, want in zip(values.shape, shape, strict=True)
-    )
-    if not fits:
+    :raises ValueError: for another shape, where ``None`` stands for any size, or no rows
+    """
+    values = th.as_tensor(values, dtype=th.float32, device=device)
+    fits = values.dim() == len(shape)
+    if not fits or any(want not in (None, have) for have, want in zip(values.shape, shape, strict=True)):
         expected = ", ".join("any" if want is None else str(want) for want in shape)
         raise ValueError(f"{name} has the shape {tuple(values.shape)}, expected ({expected}).")
     if len(values) == 0:
         raise ValueError(f"{name} is empty, expected at least one row.")
+    return values
 
 
-def check_finite(name: str, values: th.Tensor, shape: tuple[int | None, ...]) -> None:
-    """:raises ValueError: as :func:`check_shape`, and for numbers that are not finite"""
-    check_shape(name, values, shape)
+def finite_tensor(name: str, values: th.Tensor, shape: tuple[int | None, ...], device: th.device) -> th.Tensor:
+    """Return values as :func:`float_tensor` does.
+
+    :raises ValueError: as there, and for numbers that are not finite
+    """
+    values = float_tensor(name, values, shape, device)
     if not values.isfinite().all():
         raise ValueError(f"{name} has entries that are NaN or infinite; find out where they come from first.")
+    return values
 
 
 def checked_delay(delay: th.Tensor, batch_size: int, max_delay: int) -> th.Tensor:
@@ -49,3 +48,21 @@ def checked_delay(delay: th.Tensor, batch_size: int, max_delay: int) -> th.Tenso
             "with a larger max_delay."
         )
     return delay.to(th.int64)
+
+
+def checked_extra_states(
+    history: th.Tensor | None, known: th.Tensor | None, shape: tuple[int, int, int], device: th.device
+) -> tuple[th.Tensor, th.Tensor]:
+    """Return extra states and which of them are known: (B, D, obs_dim) float32 and (B, D) bool.
+
+    :raises ValueError: for only one of the two, another shape than (B, D, obs_dim), or entries that mean nothing
+    """
+    if history is None and known is None:  # zeros, so that a recorded graph always has these inputs
+        return th.zeros(shape, device=device), th.zeros(shape[:2], dtype=th.bool, device=device)
+    if history is None or known is None:
+        raise ValueError("Only one of state_history and state_known is given; give both or neither.")
+    history = finite_tensor("state_history", history, shape, device)
+    known = finite_tensor("state_known", known, shape[:2], device)
+    if not ((known == 0) | (known == 1)).all():
+        raise ValueError("state_known has entries other than 0 and 1, expected 1 where a state is known.")
+    return history, known.bool()

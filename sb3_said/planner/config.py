@@ -5,19 +5,12 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from sb3_said.planner import diffusion, dit, inpainting, normalizer, precision, values
-from sb3_said.planner.checks import check_choice
+from sb3_said.planner.diffusion import PREDICTIONS, SCHEDULES, TIME_SAMPLINGS
+from sb3_said.planner.dit import HEAD_DIM
+from sb3_said.planner.values import VALUE_SCALES
 
-SCORED_STATES = ("future", "decision", "all")
-LR_SCHEDULES = ("cosine", "constant")
 #: Settings that shape a planner's answers and none of its weights.
-SAMPLING_SETTINGS = (
-    "sampling_steps",
-    "n_candidates",
-    "temperature",
-    "scored_states",
-    "choice_factor",
-)
+SAMPLING_SETTINGS = ("sampling_steps", "n_candidates", "temperature", "scored_states", "choice_factor")
 
 
 @dataclass(frozen=True)
@@ -81,29 +74,28 @@ class PlannerConfig:
 
     def __post_init__(self) -> None:
         for name, choices in (
-            ("prediction", diffusion.PREDICTIONS),
-            ("schedule", diffusion.SCHEDULES),
-            ("time_sampling", diffusion.TIME_SAMPLINGS),
-            ("mask", inpainting.MASKS),
-            ("action_transform", normalizer.ACTION_TRANSFORMS),
-            ("scored_states", SCORED_STATES),
-            ("lr_schedule", LR_SCHEDULES),
-            ("value_scale", values.VALUE_SCALES),
-            ("precision", precision.PRECISIONS),
+            ("prediction", PREDICTIONS),
+            ("schedule", SCHEDULES),
+            ("time_sampling", TIME_SAMPLINGS),
+            ("mask", ("random", "fixed")),
+            ("action_transform", ("standard", "tanh")),
+            ("scored_states", ("future", "decision", "all")),
+            ("lr_schedule", ("cosine", "constant")),
+            ("value_scale", VALUE_SCALES),
+            ("precision", ("auto", "float32", "bfloat16")),
         ):
-            check_choice(name, getattr(self, name), choices)
+            if getattr(self, name) not in choices:
+                raise ValueError(f"{name} is {getattr(self, name)!r}, expected one of {choices}.")
         object.__setattr__(self, "betas", tuple(self.betas))  # JSON gives a list back
         at_least = {"depth": 1, "horizon": 2, "sampling_steps": 1, "n_candidates": 1, "batch_size": 1}
         at_least |= {"temperature": 0, "warmup_steps": 0, "weight_decay": 0, "weight_factor": 0, "decision_weight": 0}
+        if self.choice_factor is not None:
+            at_least["choice_factor"] = 0
         for name, smallest in at_least.items():
             if not getattr(self, name) >= smallest:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected at least {smallest}.")
-        if self.d_model < dit.HEAD_DIM or self.d_model % dit.HEAD_DIM:
-            raise ValueError(f"d_model is {self.d_model}, expected a multiple of {dit.HEAD_DIM}.")
-        if self.choice_factor is not None and not self.choice_factor >= 0:
-            raise ValueError(
-                f"choice_factor is {self.choice_factor}, expected at least 0, or None for the best candidate."
-            )
+        if self.d_model < HEAD_DIM or self.d_model % HEAD_DIM:
+            raise ValueError(f"d_model is {self.d_model}, expected a multiple of {HEAD_DIM}.")
         if not self.learning_rate > 0 or not (self.gradient_clip is None or self.gradient_clip > 0):
             raise ValueError(
                 f"learning_rate is {self.learning_rate} and gradient_clip {self.gradient_clip}, expected positive "
@@ -114,11 +106,11 @@ class PlannerConfig:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected a number in [0, 1].")
 
     def to_dict(self) -> dict[str, Any]:
-        """Return every setting in JSON types, as it comes back from a file: a tuple is a list."""
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
+        """Return every setting in JSON types, as it comes back from a file."""
+        return {**asdict(self), "betas": list(self.betas)}
 
     def weight_settings(self) -> dict[str, Any]:
-        """Return the settings that decide a training's weights: all but those of sampling, in JSON types."""
+        """Return the settings that decide a training's weights, in JSON types: all but those of sampling."""
         return {name: value for name, value in self.to_dict().items() if name not in SAMPLING_SETTINGS}
 
     @classmethod

@@ -12,8 +12,6 @@ from typing import NamedTuple
 
 import torch as th
 
-from sb3_said.planner.checks import check_choice
-
 START_TIME = 1e-3  # the cleanest time, in training and as the last solver time (CleanDiffuser, and so the paper)
 END_TIMES = {
     "cosine": 0.9946,  # alpha(1) is 0 and could not be divided by; the same stop as DPM-Solver's
@@ -30,16 +28,10 @@ def alpha_sigma(t: th.Tensor, schedule: str) -> tuple[th.Tensor, th.Tensor]:
     :param t: diffusion times in [0, ``END_TIMES[schedule]``]
     :param schedule: ``"cosine"`` (Nichol and Dhariwal 2021) or ``"linear"`` (the paper's, as in DV)
     """
-    check_choice("schedule", schedule, SCHEDULES)
     if schedule == "cosine":
         return th.cos(math.pi / 2 * t), th.sin(math.pi / 2 * t)
     log_alpha = -(20.0 - 0.1) / 4 * t**2 - 0.1 / 2 * t
     return log_alpha.exp(), (-th.expm1(2 * log_alpha)).sqrt()  # expm1: 1 - alpha^2 cancels near t = 0
-
-
-def add_noise(clean: th.Tensor, noise: th.Tensor, alpha: th.Tensor, sigma: th.Tensor) -> th.Tensor:
-    """Return the noisy sample; all arguments broadcast against each other."""
-    return alpha * clean + sigma * noise
 
 
 def prediction_target(
@@ -49,7 +41,6 @@ def prediction_target(
 
     :param prediction: ``"v"`` (Salimans and Ho 2022) or ``"epsilon"`` (the paper's)
     """
-    check_choice("prediction", prediction, PREDICTIONS)
     return noise if prediction == "epsilon" else alpha * noise - sigma * clean
 
 
@@ -57,7 +48,6 @@ def to_clean(
     output: th.Tensor, x: th.Tensor, alpha: float | th.Tensor, sigma: float | th.Tensor, prediction: str
 ) -> th.Tensor:
     """Return the clean sample that a prediction at a noisy sample x implies; arguments broadcast."""
-    check_choice("prediction", prediction, PREDICTIONS)
     return (x - sigma * output) / alpha if prediction == "epsilon" else alpha * x - sigma * output
 
 
@@ -67,23 +57,20 @@ def draw_times(
     time_sampling: str,
     end_probability: float = 0.0,
     generator: th.Generator | None = None,
-    device: th.device | str = "cpu",
 ) -> th.Tensor:
-    """Draw training times: (n,) float32 in [START_TIME, END_TIMES[schedule]].
+    """Draw training times on the generator's device: (n,) float32 in [START_TIME, END_TIMES[schedule]].
 
     :param time_sampling: ``"uniform"`` (the paper's) or ``"logit_normal"`` (Esser et al. 2024), more in the middle
     :param end_probability: part of the times that are the last one, where every sampling starts
     """
-    check_choice("schedule", schedule, SCHEDULES)
-    check_choice("time_sampling", time_sampling, TIME_SAMPLINGS)
-    source = "cpu" if generator is None else generator.device
+    device = "cpu" if generator is None else generator.device
     if time_sampling == "uniform":
-        fraction = th.rand(n, generator=generator, device=source)
+        fraction = th.rand(n, generator=generator, device=device)
     else:
-        fraction = th.randn(n, generator=generator, device=source).sigmoid()
+        fraction = th.randn(n, generator=generator, device=device).sigmoid()
     if end_probability > 0:
-        fraction = th.where(th.rand(n, generator=generator, device=source) < end_probability, 1.0, fraction)
-    return (START_TIME + (END_TIMES[schedule] - START_TIME) * fraction).to(device)
+        fraction = th.where(th.rand(n, generator=generator, device=device) < end_probability, 1.0, fraction)
+    return START_TIME + (END_TIMES[schedule] - START_TIME) * fraction
 
 
 class SolverStep(NamedTuple):
@@ -98,24 +85,20 @@ class SolverStep(NamedTuple):
 
 @cache
 def solver_steps(schedule: str, n_steps: int) -> tuple[SolverStep, ...]:
-    """Return the coefficients of DDIM's steps (Song et al. 2021, eta 0), from the noisiest time to START_TIME.
-
-    The times are uniform, as the paper's.
+    """Return the coefficients of DDIM's steps (Song et al. 2021, eta 0) at uniform times, as the paper's.
 
     :param schedule: see :func:`alpha_sigma`
     :param n_steps: number of network evaluations
-    :raises ValueError: for an unknown schedule or n_steps < 1
+    :raises ValueError: for n_steps < 1
     """
-    check_choice("schedule", schedule, SCHEDULES)
     if n_steps < 1:
         raise ValueError(f"The number of solver steps is {n_steps}, expected at least 1.")
     times = th.linspace(END_TIMES[schedule], START_TIME, n_steps + 1, dtype=th.float64)
-    alphas, sigmas = (values.tolist() for values in alpha_sigma(times, schedule))
-    steps = []
-    for i, t in enumerate(times[:-1].tolist()):
-        keep = sigmas[i + 1] / sigmas[i]
-        steps.append(SolverStep(t, alphas[i], sigmas[i], keep, alphas[i + 1] - alphas[i] * keep))
-    return tuple(steps)
+    alpha, sigma = alpha_sigma(times, schedule)  # (n_steps + 1,)
+    keep = sigma[1:] / sigma[:-1]
+    clean = alpha[1:] - alpha[:-1] * keep
+    rows = th.stack((times[:-1], alpha[:-1], sigma[:-1], keep, clean), dim=1)
+    return tuple(SolverStep(*row) for row in rows.tolist())
 
 
 def solve(

@@ -24,12 +24,7 @@ def sinusoidal_positions(length: int, d_model: int) -> th.Tensor:
 
 
 def _modulate(x: th.Tensor, shift: th.Tensor, factor: th.Tensor) -> th.Tensor:
-    """Layer-normalise the tokens, then scale and shift them.
-
-    :param x: (M, L, d_model)
-    :param shift: (M, 1, d_model), or (d_model,) for all
-    :param factor: as ``shift``
-    """
+    """Layer-normalise tokens (M, L, d_model), then scale and shift them by (M, 1, d_model), or (d_model,) for all."""
     if shift.dim() == 1:  # the norm's own affine map: one kernel instead of two
         return th.layer_norm(x, x.shape[-1:], factor, shift, 1e-6)
     return th.addcmul(shift, th.layer_norm(x, x.shape[-1:], eps=1e-6), factor)
@@ -83,15 +78,11 @@ class DiT1d(nn.Module):
     A call has three parts, because two of them do not change from one denoising step or candidate to the next:
     :meth:`modulations` depends on the time alone, :meth:`context` on what is known alone, :meth:`forward` on both.
 
-    :param obs_dim: numbers in a state
-    :param act_dim: numbers in an action
     :param max_delay: D, the most actions that can be known
     :param length: steps of the longest window
     :param d_model: width, a multiple of 32
-    :param depth: number of blocks
     :param embed_known: add an embedding of the whole known part to every token, beside showing it in its place
     :param extra_states: states at indices 1..D may be known too, and are embedded
-    :raises ValueError: for a width that is no multiple of 32
     """
 
     frequencies: th.Tensor
@@ -110,8 +101,6 @@ class DiT1d(nn.Module):
         extra_states: bool = False,
     ) -> None:
         super().__init__()
-        if d_model < HEAD_DIM or d_model % HEAD_DIM:
-            raise ValueError(f"d_model is {d_model}, but heads are {HEAD_DIM} wide: give a multiple of {HEAD_DIM}.")
         self.d_model = d_model
         self.obs_dim = obs_dim
         self.max_delay = max_delay
@@ -158,25 +147,19 @@ class DiT1d(nn.Module):
         :param window: (B, L, obs_dim + act_dim), normalised, L at most ``length``; only known entries are read
         :param known: (B, L, obs_dim + act_dim) bool known mask
         """
-        flags = th.stack((known[..., 0], known[..., self.obs_dim]), dim=-1)  # (B, L, 2): state known, action known
-        flags = flags.to(window.dtype)
+        # (B, L, 2): whether the state is known, and the action
+        flags = th.stack((known[..., 0], known[..., self.obs_dim]), dim=-1).to(window.dtype)
         added = self.flag_embedding(flags) + self.positions[: window.shape[1]]
         if self.known_embedding is None:
             return added
-        given = th.where(known, window, 0.0)
-        state = given[:, 0, : self.obs_dim]
-        # Actions, and whether they are known
-        actions = self._up_to_max_delay(th.cat([given[..., self.obs_dim :], flags[..., 1:]], dim=-1))
-        parts = [state, actions[..., :-1].flatten(1), actions[..., -1]]
-        if self.extra_states:  # states behind the first, and whether they are known
-            states = self._up_to_max_delay(th.cat([given[..., : self.obs_dim], flags[..., :1]], dim=-1)[:, 1:])
-            parts.append(states.flatten(1))
+        # Zeros stand for the steps that a window of a smaller delay does not have
+        D, padding = self.max_delay, (0, 0, 0, self.max_delay)
+        given, flags = F.pad(th.where(known, window, 0.0), padding), F.pad(flags, padding)
+        states, actions = given[..., : self.obs_dim], given[..., self.obs_dim :]
+        parts = [states[:, 0], actions[:, :D].flatten(1), flags[:, :D, 1]]
+        if self.extra_states:
+            parts.append(th.cat([states, flags[..., :1]], dim=-1)[:, 1 : D + 1].flatten(1))
         return added + self.known_embedding(th.cat(parts, dim=1))[:, None]
-
-    def _up_to_max_delay(self, rows: th.Tensor) -> th.Tensor:
-        """Return the first D rows of (B, L, n), zeros behind the end of a shorter window: (B, D, n)."""
-        rows = rows[:, : self.max_delay]
-        return F.pad(rows, (0, 0, 0, self.max_delay - rows.shape[1]))
 
     def forward(
         self, x: th.Tensor, context: th.Tensor, modulations: th.Tensor, valid: th.Tensor | None = None

@@ -1,18 +1,13 @@
 """What of a window is known: the delayed observation and the actions sent since (the paper's section on SAID).
 
 Observations that arrive late or out of order are known too: any of the states s_{t-D+1..t}. Those younger than s_{t-d}
-lie at indices 1..d of the window. Older ones lie before it, and are dropped: by the Markov property they say nothing
-about what follows s_{t-d} that it does not say itself.
+lie at indices 1..d of the window. Older ones are dropped: given s_{t-d}, they add nothing (Markov property).
 """
 
 from __future__ import annotations
 
 import torch as th
 import torch.nn.functional as F
-
-from sb3_said.planner.checks import check_choice
-
-MASKS = ("random", "fixed")
 
 
 def known_mask(
@@ -76,41 +71,33 @@ def draw_delays(
     mask: str = "random",
     end_probability: float = 0.0,
     generator: th.Generator | None = None,
-    device: th.device | str = "cpu",
 ) -> th.Tensor:
-    """Draw the mask lengths of a training batch: (B,) int64 in 0..D.
+    """Draw the mask lengths of a training batch on the generator's device: (B,) int64 in 0..D.
 
     :param mask: ``"random"``: one network for every delay up to D; ``"fixed"``: always D (the paper's)
     :param end_probability: with this probability a random length is 0 or D, half each, instead of uniform over 0..D:
         0 starts every episode and D is the longest and hardest
-    :raises ValueError: for an unknown mask
     """
-    check_choice("mask", mask, MASKS)
+    device = "cpu" if generator is None else generator.device
     if mask == "fixed":
         return th.full((batch_size,), max_delay, device=device)
-    source = "cpu" if generator is None else generator.device
-    uniform = th.randint(max_delay + 1, (batch_size,), generator=generator, device=source)
-    ends = max_delay * th.randint(2, (batch_size,), generator=generator, device=source)
-    at_end = th.rand(batch_size, generator=generator, device=source) < end_probability
-    return th.where(at_end, ends, uniform).to(device)
+    uniform = th.randint(max_delay + 1, (batch_size,), generator=generator, device=device)
+    ends = max_delay * th.randint(2, (batch_size,), generator=generator, device=device)
+    at_end = th.rand(batch_size, generator=generator, device=device) < end_probability
+    return th.where(at_end, ends, uniform)
 
 
 def draw_known_states(
-    batch_size: int,
-    max_delay: int,
-    probability: float,
-    generator: th.Generator | None = None,
-    device: th.device | str = "cpu",
+    batch_size: int, max_delay: int, probability: float, generator: th.Generator | None = None
 ) -> th.Tensor:
-    """Draw which of the states s_{t-D+1..t} a training batch shows: (B, D) bool.
+    """Draw which of the states s_{t-D+1..t} a training batch shows, on the generator's device: (B, D) bool.
 
-    In a window that shows any, each is known with a probability of the window's own, uniform in [0, 1]: then any number
-    of them is as likely as any other.
+    A window that shows any draws its own share of known states, uniform in [0, 1]: every number of them is as likely.
 
     :param probability: of a window to show any
     """
-    source = "cpu" if generator is None else generator.device
-    shows_any = th.rand(batch_size, 1, generator=generator, device=source) < probability
-    share = th.rand(batch_size, 1, generator=generator, device=source)
-    known = th.rand(batch_size, max_delay, generator=generator, device=source) < share
-    return (known & shows_any).to(device)
+    device = "cpu" if generator is None else generator.device
+    shows_any = th.rand(batch_size, 1, generator=generator, device=device) < probability
+    share = th.rand(batch_size, 1, generator=generator, device=device)
+    known = th.rand(batch_size, max_delay, generator=generator, device=device) < share
+    return known & shows_any

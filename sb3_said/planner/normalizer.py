@@ -5,10 +5,8 @@ from __future__ import annotations
 import torch as th
 from torch import nn
 
-from sb3_said.planner.checks import check_choice
 from sb3_said.replay.windows import Windows
 
-ACTION_TRANSFORMS = ("standard", "tanh")
 LARGEST_ACTION = 0.999  # the paper's bound before arctanh
 
 
@@ -16,16 +14,12 @@ class Normalizer(nn.Module):
     """Z-score states and actions; its statistics are buffers, so they are saved with the planner.
 
     With ``relative_states`` a window holds, behind its first state, how far each state has moved from there, in
-    standard deviations of such moves at that index. States a few steps apart differ by little, and errors count in
-    that little.
+    standard deviations of such moves at that index: states a few steps apart differ by little, and that little counts.
 
-    :param obs_dim: numbers in a state
-    :param act_dim: numbers in an action
     :param window_length: L, steps of a window
     :param relative_states: see above; False z-scores every state alike (paper)
     :param action_transform: ``"standard"``: z-score actions as they are, and clip them on the way back; ``"tanh"`` (the
         paper's): clip to 0.999, arctanh, z-score, and back through tanh
-    :raises ValueError: for an unknown transform
     """
 
     state_mean: th.Tensor
@@ -43,10 +37,9 @@ class Normalizer(nn.Module):
         relative_states: bool = False,
     ) -> None:
         super().__init__()
-        self.obs_dim, self.act_dim = obs_dim, act_dim
+        self.sizes = [obs_dim, act_dim]
         self.relative_states = relative_states
         self.register_buffer("move_std", th.ones(window_length - 1, obs_dim))
-        check_choice("action_transform", action_transform, ACTION_TRANSFORMS)
         self.action_transform = action_transform
         for name, size in (("state", obs_dim), ("action", act_dim)):
             self.register_buffer(f"{name}_mean", th.zeros(size))
@@ -54,11 +47,7 @@ class Normalizer(nn.Module):
 
     @th.no_grad()
     def fit(self, states: th.Tensor, actions: th.Tensor) -> None:
-        """Take over the mean and standard deviation of the data.
-
-        :param states: (M, obs_dim) float32, environment units
-        :param actions: (M, act_dim) float32, in [-1, 1]
-        """
+        """Take over the mean and standard deviation of states (M, obs_dim) and actions (M, act_dim), float32."""
         for name, values in (("state", states), ("action", self._bend(actions))):
             variance, mean = th.var_mean(values, dim=0, correction=0)
             std = variance.sqrt()
@@ -69,10 +58,7 @@ class Normalizer(nn.Module):
 
     @th.no_grad()
     def fit_moves(self, windows: Windows) -> None:
-        """Take over how far states move within a window, index by index; after :meth:`fit`.
-
-        :param windows: (B, L, obs_dim), environment units
-        """
+        """Take over how far states move within a window, index by index; after :meth:`fit`."""
         z = self.normalize_states(windows.states)
         moves, valid = z[:, 1:] - z[:, :1], windows.valid[:, 1:, None]
         std = (th.where(valid, moves**2, 0.0).sum(0) / valid.sum(0).clamp(min=1)).sqrt()  # (L - 1, obs_dim)
@@ -93,7 +79,7 @@ class Normalizer(nn.Module):
 
     def denormalize(self, x: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Invert :meth:`normalize`: states and actions, the latter in [-1, 1] whatever is given."""
-        z, actions = x.split([self.obs_dim, self.act_dim], dim=-1)
+        z, actions = x.split(self.sizes, dim=-1)
         if self.relative_states:
             first = z[..., :1, :]
             z = th.cat([first, first + z[..., 1:, :] * self.move_std[: z.shape[-2] - 1]], dim=-2)

@@ -10,13 +10,13 @@ import torch as th
 from torch import nn
 
 from sb3_said.planner import diffusion, inpainting
-from sb3_said.planner.checks import check_finite, check_shape, checked_delay
+from sb3_said.planner.checks import checked_delay, checked_extra_states, finite_tensor, float_tensor
 from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.dit import DiT1d
 from sb3_said.planner.graphs import RecordedFunction
 from sb3_said.planner.normalizer import Normalizer
 from sb3_said.planner.precision import autocast
-from sb3_said.planner.selection import ValueFn, choose, mean_value, value_of
+from sb3_said.planner.selection import ValueFn, choose, score
 from sb3_said.replay.windows import Windows
 
 MAX_GRAPHS = 8  # of a GPU; each keeps the memory of one decision
@@ -56,6 +56,7 @@ class InpaintingPlanner(nn.Module):
             )
         self.config = config = PlannerConfig() if config is None else config
         self.obs_dim, self.act_dim, self.max_delay = obs_dim, act_dim, max_delay
+        self.sizes = [obs_dim, act_dim]
         self.window_length = max_delay + config.horizon
         self.network = DiT1d(
             obs_dim,
@@ -81,9 +82,8 @@ class InpaintingPlanner(nn.Module):
         return self.normalizer.state_mean.device
 
     def check_ages(self, ages: Sequence[int]) -> None:
-        """Refuse ages amid an episode that the network was not trained to plan at.
+        """Refuse ages amid an episode, in control steps, that the network was not trained for.
 
-        :param ages: in control steps
         :raises ValueError: for ages above ``max_delay``; with ``mask="fixed"``, for any other than ``max_delay``
         """
         if self.config.mask == "fixed" and any(age != self.max_delay for age in ages):
@@ -97,17 +97,16 @@ class InpaintingPlanner(nn.Module):
             )
 
     def fit_normalizer(self, states: th.Tensor, actions: th.Tensor, windows: Windows | None = None) -> None:
-        """Set the mean and standard deviation that states and (transformed) actions are z-scored with.
+        """Fit the z-scores of states and (transformed) actions.
 
         :param states: (M, obs_dim), environment units
         :param actions: (M, act_dim), in [-1, 1]
-        :param windows: of ``window_length`` steps, to scale the moves of ``config.relative_states`` by; left out, moves
-            keep the states' own scale
+        :param windows: of ``window_length`` steps, which give the moves of ``config.relative_states`` their scale;
+            without them, moves keep the states' own
         :raises ValueError: for a wrong shape, no rows, or numbers that are not finite
         """
-        states, actions = self._tensor(states), self._tensor(actions)
-        check_finite("states", states, (None, self.obs_dim))
-        check_finite("actions", actions, (len(states), self.act_dim))
+        states = finite_tensor("states", states, (None, self.obs_dim), self.device)
+        actions = finite_tensor("actions", actions, (len(states), self.act_dim), self.device)
         self.normalizer.fit(states, actions)
         if windows is not None:
             self.normalizer.fit_moves(windows.to(self.device))
@@ -121,9 +120,8 @@ class InpaintingPlanner(nn.Module):
     ) -> th.Tensor:
         """Return the weighted mean squared error over unknown entries of valid steps (the paper's Algorithm 1).
 
-        The decision index counts ``config.decision_weight`` times as much as the others. Of a window of delay d only
-        the first d + ``config.horizon`` steps exist. Which states are known beside the first is drawn as
-        ``config.extra_state_probability`` says.
+        The decision index counts ``config.decision_weight`` times as much as the others. A window of delay d has
+        d + ``config.horizon`` steps; the rest is ignored.
 
         :param windows: B windows of ``window_length`` steps, environment units
         :param delay: (B,) mask lengths; drawn as ``config.mask`` says by default
@@ -132,40 +130,35 @@ class InpaintingPlanner(nn.Module):
         :return: float32 scalar
         :raises ValueError: for windows of another shape or delays outside 0..max_delay (on a GPU, delays are not read)
         """
-        config, device = self.config, self.device
-        states, actions = self._tensor(windows.states), self._tensor(windows.actions)
-        check_shape("windows.states", states, (None, self.window_length, self.obs_dim))
+        config, device, length = self.config, self.device, self.window_length
+        states = float_tensor("windows.states", windows.states, (None, length, self.obs_dim), device)
         n = len(states)
-        check_shape("windows.actions", actions, (n, self.window_length, self.act_dim))
+        actions = float_tensor("windows.actions", windows.actions, (n, length, self.act_dim), device)
         if weight is not None:
-            check_shape("weight", weight := self._tensor(weight), (n,))
+            weight = float_tensor("weight", weight, (n,), device)
         if delay is None:
             delay = inpainting.draw_delays(n, self.max_delay, config.mask, config.mask_end_probability, generator)
         # Delays on a GPU are not read back: every update would wait for it, and a recorded one could not
-        delay = checked_delay(delay, n, self.max_delay).to(self.device) if delay.device.type == "cpu" else delay
-        valid = windows.valid.to(device) & self._within(delay, self.window_length)  # (B, L)
+        delay = checked_delay(delay, n, self.max_delay).to(device) if delay.device.type == "cpu" else delay
+        valid = windows.valid.to(device) & self._within(delay, length)  # (B, L)
         clean = self.normalizer.normalize(states, actions)  # (B, L, obs_dim + act_dim)
-        # Steps behind an episode's end repeat its last row: they are neither shown as known nor learned, and no more
-        # are those behind the horizon, so that a decision at a small delay can do without them
+        # Steps that are not valid are neither shown nor learned: those behind an episode's end repeat its last row,
+        # and a decision at a small delay does without those behind its horizon
         state_known = None
         if config.extra_state_probability > 0:
-            state_known = inpainting.draw_known_states(
-                n, self.max_delay, config.extra_state_probability, generator, device
-            )
-        known = inpainting.known_mask(delay, self.window_length, self.obs_dim, self.act_dim, state_known)
-        known = known & valid[..., None]
+            state_known = inpainting.draw_known_states(n, self.max_delay, config.extra_state_probability, generator)
+            state_known = state_known.to(device)
+        known = inpainting.known_mask(delay, length, self.obs_dim, self.act_dim, state_known) & valid[..., None]
         noise = self._noise(clean.shape, generator)
-        t = diffusion.draw_times(
-            n, config.schedule, config.time_sampling, config.end_time_probability, generator, device
-        )
+        t = diffusion.draw_times(n, config.schedule, config.time_sampling, config.end_time_probability, generator)
+        t = t.to(device)
         alpha, sigma = (factor[:, None, None] for factor in diffusion.alpha_sigma(t, config.schedule))
-        x = th.where(known, clean, diffusion.add_noise(clean, noise, alpha, sigma))
-        network = self.network
+        x = th.where(known, clean, alpha * clean + sigma * noise)
         with autocast(config.precision, device):
-            output = network(x, network.context(clean, known), network.modulations(t), valid)
+            output = self.network(x, self.network.context(clean, known), self.network.modulations(t), valid)
         target = diffusion.prediction_target(clean, noise, alpha, sigma, config.prediction)
         learned = valid[..., None] & ~known
-        decision = th.arange(self.window_length, device=device) == delay[:, None]  # (B, L)
+        decision = th.arange(length, device=device) == delay[:, None]  # (B, L)
         share = th.where(decision[..., None], config.decision_weight, 1.0) * learned  # (B, L, obs_dim + act_dim)
         error = th.where(learned, (output.float() - target) ** 2, 0.0) * share
         if weight is not None:
@@ -189,50 +182,54 @@ class InpaintingPlanner(nn.Module):
     ) -> Plan:
         """Inpaint N candidate windows per decision and choose the one of the highest mean value (MCSS).
 
-        With ``config.choice_factor`` the decision is the candidates' mean instead, weighed by their values.
+        With ``config.choice_factor`` the decision is the candidates' mean instead, weighed by their values. At
+        temperature 0, where all candidates are alike, and by default without a ``value_fn``, only one is drawn.
 
-        The arguments that default to ``None`` take the config's value. One candidate is enough, and drawn, where the
-        others could not matter: at temperature 0, where all are alike, and by default without a ``value_fn``.
+        On a GPU, a few calls with the same sizes and settings record the decision as one graph. The ``value_fn`` must
+        then be a module or a method of one and never wait for the device. With any other ``value_fn``, which may read
+        what a graph would not see change, nothing is recorded.
 
-        On a GPU a decision becomes one recorded graph after a few calls with these sizes and settings, if the
-        ``value_fn`` is a module or a method of one, which must then never wait for the device. Any other ``value_fn``
-        may read what a graph would not see change: its plans are made operation by operation.
-
-        A planner with ``mask="fixed"`` has known ``max_delay`` actions in every window. At an episode's start, s_0
-        stands for s_{t-D} and zeros for the actions before it (paper, Appendix B).
+        With ``mask="fixed"`` every window has ``max_delay`` known actions. At an episode's start, s_0 stands for
+        s_{t-D} and zeros for the actions before it (paper, Appendix B).
 
         :param observation: (B, obs_dim) delayed observations s_{t-d}
         :param action_history: (B, D, act_dim), the D newest actions, oldest first
         :param delay: (B,) integers d in 0..D, not necessarily alike
         :param value_fn: maps states (B, N, K, obs_dim) and actions (B, N, K, act_dim), environment units, to values
             (B, N, K); without it all values are 0 and the first candidate is taken
-        :param n_candidates: N
+        :param n_candidates: N; this and the next two by default as in the config
         :param sampling_steps: denoising steps
         :param temperature: factor on the initial noise
         :param noise: (N, ``window_length``, obs_dim + act_dim) standard normal initial noise, shared by all decisions,
             to repeat a plan
         :param generator: of the initial noise where none is given; torch's global one by default
         :param state_history: (B, D, obs_dim), the states s_{t-D+1..t}, oldest first, any finite numbers where they are
-            not known. Those younger than s_{t-d} stay as they are in every candidate; older ones add nothing (Markov
-            property) and are not read. Needs ``config.extra_state_probability`` above 0
+            not known. Every candidate keeps those younger than s_{t-d}; older ones add nothing (Markov property) and
+            are not read. Needs ``config.extra_state_probability`` above 0
         :param state_known: (B, D), 1 where a state of ``state_history`` is known and 0 elsewhere; none is by default
         :raises ValueError: for wrong shapes, numbers that are not finite, delays outside 0..max_delay, or extra states
             that the network was not trained with
         """
-        config = self.config
-        observation, action_history = self._tensor(observation), self._tensor(action_history)
-        check_finite("observation", observation, (None, self.obs_dim))
+        config, device = self.config, self.device
+        observation = finite_tensor("observation", observation, (None, self.obs_dim), device)
         n = len(observation)
-        check_finite("action_history", action_history, (n, self.max_delay, self.act_dim))
-        delay = self._trained_delay(checked_delay(delay, n, self.max_delay).to(self.device), action_history)
-        extra_states = self._extra_states(state_history, state_known, n)
+        action_history = finite_tensor("action_history", action_history, (n, self.max_delay, self.act_dim), device)
+        delay = self._trained_delay(checked_delay(delay, n, self.max_delay).to(device), action_history)
+        extra_states: tuple[th.Tensor, ...] = ()
+        if config.extra_state_probability > 0:
+            shape = (n, self.max_delay, self.obs_dim)
+            extra_states = checked_extra_states(state_history, state_known, shape, device)
+        elif state_history is not None or state_known is not None:
+            raise ValueError(
+                "This planner is not trained with extra known states; build and train it with "
+                "PlannerConfig(extra_state_probability=0.5), or leave state_history and state_known out."
+            )
         shortest, longest = int(delay.min()), int(delay.max())
         length = longest + config.horizon  # a decision costs what its age costs
         temperature = config.temperature if temperature is None else temperature
-        shape = (length, self.obs_dim + self.act_dim)
+        window = (length, self.obs_dim + self.act_dim)
         if noise is not None:
-            noise = self._tensor(noise)
-            check_finite("noise", noise, (n_candidates, self.window_length, shape[1]))
+            noise = finite_tensor("noise", noise, (n_candidates, self.window_length, window[1]), device)
             n_candidates, noise = len(noise), noise[:, :length]
         elif n_candidates is None:
             n_candidates = 1 if value_fn is None else config.n_candidates
@@ -244,11 +241,11 @@ class InpaintingPlanner(nn.Module):
         steps = diffusion.solver_steps(config.schedule, n_steps)
 
         if temperature == 0:
-            x = th.zeros(n, 1, *shape, device=self.device)
+            x = th.zeros(n, 1, *window, device=device)
         else:
-            noise = self._noise((n, n_candidates, *shape), generator) if noise is None else noise
+            noise = self._noise((n, n_candidates, *window), generator) if noise is None else noise
             x = temperature * noise.expand(n, -1, -1, -1)  # (B, N, L, obs_dim + act_dim)
-        times = th.tensor([step.t for step in steps], device=self.device)
+        times = th.tensor([step.t for step in steps], device=device)
         inputs = (times, observation, action_history, delay, x, *extra_states)
         if self._can_be_recorded(value_fn):
             plan = Plan(*self._graph(steps, value_fn, x.shape)(*inputs))
@@ -288,18 +285,19 @@ class InpaintingPlanner(nn.Module):
         state_history: th.Tensor | None = None,
         state_known: th.Tensor | None = None,
     ) -> Plan:
-        """Go from what is known and initial noise to the decision, without waiting for the device on the way.
+        """Go from what is known and initial noise to the decision, and never wait for the device on the way.
 
-        :param shortest: a lower bound of the delays: no state before it is scored
+        :param shortest: a lower bound of the delays
         :param is_mixed: whether delays may differ, so that some windows end before others
         :param times: (n_steps,) of the steps
         :param x: (B, N, L, obs_dim + act_dim) initial noise, scaled
-        :param state_history: (B, D, obs_dim), and which of it is known: ``state_known``, (B, D) bool
+        :param state_history: (B, D, obs_dim)
+        :param state_known: (B, D) bool
         """
         length = x.shape[2]
         given = inpainting.known_window(observation, action_history, delay, length, state_history)
         known = inpainting.known_mask(delay, length, self.obs_dim, self.act_dim, state_known)
-        clean = self.normalizer.normalize(*self._split(given))  # (B, L, obs_dim + act_dim), as given and known
+        clean = self.normalizer.normalize(*given.split(self.sizes, dim=-1))  # (B, L, obs_dim + act_dim)
         valid = self._within(delay, length).repeat_interleave(x.shape[1], 0) if is_mixed else None  # (B * N, L)
         network = self.network
         modulations = network.modulations(times)  # (n_steps, 6 * depth + 2, d_model)
@@ -314,38 +312,25 @@ class InpaintingPlanner(nn.Module):
                 self.config.prediction,
                 impose=lambda x: th.where(known[:, None], clean[:, None], x),
             )
-        # What is given comes back exactly as given, without the rounding of the normaliser
+        # Known entries come back as given, without the normaliser's rounding
         x = th.where(known[:, None], given[:, None], th.cat(self.normalizer.denormalize(x), dim=-1))
-        states, actions = self._split(x)
+        states, actions = x.split(self.sizes, dim=-1)
         rows = th.arange(len(x), device=x.device)
         present = states[rows, :, delay].mean(1)  # (B, obs_dim)
-        decisions = actions[rows, :, delay]  # (B, N, act_dim)
         if value_fn is None:
             values = th.zeros(x.shape[:2], device=x.device)
-        elif self.config.scored_states == "decision":
-            shared = present[:, None].expand(-1, x.shape[1], -1)  # (B, N, obs_dim)
-            values = value_of(value_fn, shared[:, :, None], decisions[:, :, None])[..., 0]
         else:
-            first = th.ones_like(delay) if self.config.scored_states == "all" else delay + 1  # (B,)
-            skipped = 1 if self.config.scored_states == "all" else shortest + 1
-            end = delay + self.config.horizon
-            values = mean_value(value_fn, states, actions, first, end, skipped)
-        return Plan(choose(decisions, values, self.config.choice_factor), present, states, actions, values)
+            values = score(value_fn, self.config, states, actions, delay, shortest)
+        action = choose(actions[rows, :, delay], values, self.config.choice_factor)
+        return Plan(action, present, states, actions, values)
 
     def _within(self, delay: th.Tensor, length: int) -> th.Tensor:
         """Tell which steps a window of each delay has, d + horizon of them: (B, L) bool."""
         return th.arange(length, device=delay.device) < delay[:, None] + self.config.horizon
 
-    def _split(self, x: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        states, actions = x.split([self.obs_dim, self.act_dim], dim=-1)
-        return states, actions
-
     def _noise(self, shape: tuple[int, ...], generator: th.Generator | None) -> th.Tensor:
         source = self.device if generator is None else generator.device
         return th.randn(shape, generator=generator, device=source).to(self.device)
-
-    def _tensor(self, values: th.Tensor) -> th.Tensor:
-        return th.as_tensor(values, dtype=th.float32, device=self.device)
 
     def _trained_delay(self, delay: th.Tensor, action_history: th.Tensor) -> th.Tensor:
         """Return the delays to plan with: (B,) int64; with ``mask="fixed"`` D, at the start of an episode too.
@@ -358,29 +343,6 @@ class InpaintingPlanner(nn.Module):
         amid = (action_history.ne(0).any(-1) & older).any(1)  # (B,): acted on longer ago than the observation is old
         self.check_ages(delay[amid].tolist())
         return th.full_like(delay, self.max_delay)
-
-    def _extra_states(
-        self, state_history: th.Tensor | None, state_known: th.Tensor | None, batch_size: int
-    ) -> tuple[th.Tensor, ...]:
-        """Return checked extra states, (B, D, obs_dim) and (B, D) bool, or nothing if the config has none."""
-        if (state_history is None) != (state_known is None):
-            raise ValueError("Only one of state_history and state_known is given; give both or neither.")
-        if self.config.extra_state_probability == 0:
-            if state_history is not None:
-                raise ValueError(
-                    "This planner is not trained with extra known states; build and train it with "
-                    "PlannerConfig(extra_state_probability=0.5), or leave state_history and state_known out."
-                )
-            return ()
-        shape = (batch_size, self.max_delay)
-        if state_history is None or state_known is None:  # zeros, so that a recorded graph always has these inputs
-            state_history, state_known = th.zeros(*shape, self.obs_dim), th.zeros(shape)
-        state_history, state_known = self._tensor(state_history), self._tensor(state_known)
-        check_finite("state_history", state_history, (*shape, self.obs_dim))
-        check_finite("state_known", state_known, shape)
-        if not ((state_known == 0) | (state_known == 1)).all():
-            raise ValueError("state_known has entries other than 0 and 1, expected 1 where a state is known.")
-        return state_history, state_known.bool()
 
 
 def _owner(value_fn: ValueFn) -> object:

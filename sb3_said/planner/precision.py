@@ -1,4 +1,4 @@
-"""In which number format networks compute."""
+"""The number format in which networks compute."""
 
 from __future__ import annotations
 
@@ -7,9 +7,6 @@ from contextlib import AbstractContextManager, nullcontext
 
 import torch as th
 
-from sb3_said.planner.checks import check_choice
-
-PRECISIONS = ("auto", "float32", "bfloat16")
 #: Numbers in the activations, below which a CPU converts them for longer than bfloat16 saves in products
 SMALL = 48 * 128
 
@@ -30,9 +27,7 @@ def compute_dtype(precision: str, device: th.device, size: float = math.inf) -> 
     :param precision: ``"auto"`` (bfloat16 where :func:`has_bfloat16`, and on a CPU where it pays), ``"float32"`` or
         ``"bfloat16"``
     :param size: numbers in the activations, tokens times width
-    :raises ValueError: for another name
     """
-    check_choice("precision", precision, PRECISIONS)
     pays = has_bfloat16(device) and (device.type != "cpu" or size >= SMALL)
     return th.bfloat16 if precision == "bfloat16" or (precision == "auto" and pays) else th.float32
 

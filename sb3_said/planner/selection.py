@@ -1,4 +1,4 @@
-"""Monte-Carlo sampling with selection (MCSS): what candidates are worth, and which decision that makes."""
+"""Monte-Carlo sampling with selection (MCSS): score the candidates, and choose the decision."""
 
 from __future__ import annotations
 
@@ -6,11 +6,34 @@ from collections.abc import Callable
 
 import torch as th
 
+from sb3_said.planner.config import PlannerConfig
+
 #: Maps states (B, N, K, obs_dim) and actions (B, N, K, act_dim), in environment units, to values (B, N, K)
 ValueFn = Callable[[th.Tensor, th.Tensor], th.Tensor]
 
 
-def value_of(value_fn: ValueFn, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
+def score(
+    value_fn: ValueFn, config: PlannerConfig, states: th.Tensor, actions: th.Tensor, delay: th.Tensor, shortest: int
+) -> th.Tensor:
+    """Return the mean value of each candidate's steps that ``config.scored_states`` names: (B, N).
+
+    :param states: (B, N, L, obs_dim)
+    :param actions: (B, N, L, act_dim)
+    :param delay: (B,) int64, the indices of the decisions
+    :param shortest: a lower bound of the delays; for ``"future"``, steps up to there are not even valued
+    """
+    if config.scored_states == "decision":
+        rows = th.arange(len(states), device=states.device)
+        present, decisions = states[rows, :, delay].mean(1, keepdim=True), actions[rows, :, delay]  # (B, 1 or N, dim)
+        return _value_of(value_fn, present.expand(-1, states.shape[1], -1)[:, :, None], decisions[:, :, None])[..., 0]
+    before, first = (delay, shortest + 1) if config.scored_states == "future" else (0 * delay, 1)
+    values = _value_of(value_fn, states[:, :, first:], actions[:, :, first:])  # (B, N, L - first)
+    steps = th.arange(first, states.shape[2], device=states.device)
+    scored = ((steps > before[:, None]) & (steps < delay[:, None] + config.horizon))[:, None]  # (B, 1, L - first)
+    return th.where(scored, values, 0.0).sum(-1) / scored.sum(-1)
+
+
+def _value_of(value_fn: ValueFn, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
     """Return the value of each step: (B, N, K) float32.
 
     :raises ValueError: when the function returns another shape
@@ -24,27 +47,10 @@ def value_of(value_fn: ValueFn, states: th.Tensor, actions: th.Tensor) -> th.Ten
     return values
 
 
-def mean_value(
-    value_fn: ValueFn, states: th.Tensor, actions: th.Tensor, first: th.Tensor, end: th.Tensor, skipped: int
-) -> th.Tensor:
-    """Return the mean value of each candidate's steps ``first`` to ``end - 1``: (B, N).
-
-    :param states: (B, N, L, obs_dim)
-    :param actions: (B, N, L, act_dim)
-    :param first: (B,) int64, at least ``skipped``
-    :param end: (B,) int64
-    :param skipped: steps at the beginning that nobody counts and that are not valued
-    """
-    values = value_of(value_fn, states[:, :, skipped:], actions[:, :, skipped:])  # (B, N, L - skipped)
-    steps = th.arange(skipped, states.shape[2], device=states.device)
-    scored = ((steps >= first[:, None]) & (steps < end[:, None]))[:, None]  # (B, 1, L - skipped)
-    return th.where(scored, values, 0.0).sum(-1) / scored.sum(-1)
-
-
 def choose(actions: th.Tensor, values: th.Tensor, factor: float | None) -> th.Tensor:
     """Return one action of N: the most valuable, or the mean weighed by exp(factor * z), z the standardised values.
 
-    Where the present is uncertain, the most valuable of many is mostly a lucky one, and acting on luck is jittery.
+    Where the present is uncertain, the most valuable of many candidates mostly owes its value to luck.
 
     :param actions: (B, N, act_dim)
     :param values: (B, N)

@@ -9,13 +9,14 @@ from dataclasses import replace
 from typing import Any
 
 import torch as th
+import torch.nn.functional as F
 
 from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.graphs import RecordedFunction
 from sb3_said.planner.inpainting import draw_delays
 from sb3_said.planner.planner import InpaintingPlanner
 from sb3_said.planner.values import scaled_values, window_weight
-from sb3_said.planner.yardstick import Present, RegressionYardstick
+from sb3_said.planner.yardstick import RegressionYardstick
 from sb3_said.replay.windows import Windows, WindowSource
 
 HELD_OUT_WINDOWS = 1024  # per delay, in evaluate(): tells errors that differ by 2 % apart
@@ -36,8 +37,7 @@ def learning_rate(step: int, gradient_steps: int, config: PlannerConfig) -> floa
 def ema_decay(step: int, config: PlannerConfig) -> float:
     """Return the decay of the averaged weights after update ``step`` = 0, 1, ...
 
-    With ``ema_warmup`` it rises to its full value, because a full-length average still holds mostly initial weights in
-    a short run.
+    With ``ema_warmup`` it rises to its full value: in a short run, a full-length average is mostly initial weights.
     """
     if not config.ema_warmup:
         return config.ema_decay
@@ -45,11 +45,10 @@ def ema_decay(step: int, config: PlannerConfig) -> float:
 
 
 def worse_than_regression(errors: dict[str, float], tolerance: float = 0.05) -> str:
-    """Name what a planner should not be left with: errors above those of the regression beside it.
+    """Name the errors that lie above those of the regression, such as ``"present_error_d4 0.31 against 0.20"``.
 
     :param errors: of :meth:`PlannerTrainer.evaluate`
     :param tolerance: part by which an error may lie above, for windows are few
-    :return: such as ``"present_error_d4 0.31 against 0.20"``, empty where none is worse
     """
     bars = {name.replace("_mlp", ""): bar for name, bar in errors.items() if "_mlp" in name}
     return ", ".join(
@@ -62,15 +61,13 @@ def worse_than_regression(errors: dict[str, float], tolerance: float = 0.05) -> 
 class PlannerTrainer:
     """Train a planner on windows of states and actions.
 
-    The weights that gradient steps move belong to the trainer (``online``). The planner handed in holds their
-    exponential moving average after every update, so it can be used, saved and evaluated between any two of them.
+    Gradient steps move the trainer's own weights (``online``). After every update the planner handed in holds their
+    exponential moving average, ready to be used, saved and evaluated. A small regression learns from the same batches,
+    as the bar for the planner's errors.
 
-    All draws come from a generator of the trainer's own, and on the CPU a run that was saved and resumed ends bit for
-    bit as if it had never stopped (a GPU's sums do not repeat themselves exactly). A small regression is trained on
-    the same batches, as the bar for the planner's errors.
-
-    On a GPU the data is copied there once, the draws are made there, and from the fourth update on a whole update is
-    one recorded graph. No update waits for the device; losses are read at log times.
+    All draws come from the trainer's own generator. On the CPU a resumed run ends bit for bit as if it had never
+    stopped; a GPU's sums do not repeat themselves exactly. A GPU holds the data, makes the draws, and runs each update
+    from the fourth on as one recorded graph. No update waits for it; losses are read at log times.
 
     :param planner: trained in place; its normaliser is fitted to the training part of ``source``
     :param source: windows of the true, undelayed states and the actions
@@ -133,6 +130,8 @@ class PlannerTrainer:
         self.yardstick_optimizer = th.optim.Adam(
             self.yardstick.parameters(), lr=self._rate(YARDSTICK_LEARNING_RATE), **fused
         )
+        self._modules = {"planner": planner, "online": self.online, "yardstick": self.yardstick}
+        self._optimizers = {"optimizer": self.optimizer, "yardstick_optimizer": self.yardstick_optimizer}
         self._averaged: list[th.Tensor] = list(planner.parameters())
         self._online: list[th.Tensor] = list(self.online.parameters())
         # Read at log times only: a read per update would make a GPU wait for it.
@@ -148,8 +147,10 @@ class PlannerTrainer:
         :raises FloatingPointError: when a loss was not finite (looked at every 100 updates)
         """
         rate = learning_rate(self.n_updates, self.gradient_steps, self.config)
-        self._set_rate(self.optimizer, rate)
-        self._set_rate(self.yardstick_optimizer, rate * YARDSTICK_LEARNING_RATE / self.config.learning_rate)
+        yardstick_rate = rate * YARDSTICK_LEARNING_RATE / self.config.learning_rate
+        for optimizer, new in ((self.optimizer, rate), (self.yardstick_optimizer, yardstick_rate)):
+            (group,) = optimizer.param_groups
+            group["lr"] = group["lr"].fill_(new) if isinstance(group["lr"], th.Tensor) else new
         (losses,) = self._descend() if self._recorded is None else self._recorded()  # (2,)
         with th.no_grad():  # not recorded: the decay changes from update to update
             th._foreach_lerp_(self._averaged, self._online, 1.0 - ema_decay(self.n_updates, self.config))
@@ -162,16 +163,13 @@ class PlannerTrainer:
             self._check_finite()
 
     def _descend(self) -> tuple[th.Tensor]:
-        """Draw a batch and move the online weights and the yardstick's, reading no number off the device.
-
-        :return: one tensor (2,) float32, the planner's loss and the yardstick's
-        """
+        """Draw a batch, move both sets of weights, and return both losses, (2,), without waiting for the device."""
         config = self.config
-        self.optimizer.zero_grad()
-        self.yardstick_optimizer.zero_grad()
+        for optimizer in self._optimizers.values():
+            optimizer.zero_grad()
         windows = self.source.sample(config.batch_size, self.planner.window_length, self.generator)
         mask = config.mask, config.mask_end_probability
-        delay = draw_delays(config.batch_size, self.planner.max_delay, *mask, self.generator, self.device)  # (B,)
+        delay = draw_delays(config.batch_size, self.planner.max_delay, *mask, self.generator).to(self.device)  # (B,)
         weight = window_weight(windows.values, config.weight_factor)  # (B,)
         loss = self.online.loss(windows, delay, weight, self.generator)
         loss.backward()
@@ -179,7 +177,8 @@ class PlannerTrainer:
             th.nn.utils.clip_grad_norm_(self._online, config.gradient_clip)
         self.optimizer.step()
 
-        yardstick_loss = self.yardstick.loss(*self._yardstick_batch(windows, delay), weight)
+        windows = windows._replace(states=self.planner.normalizer.normalize_states(windows.states))
+        yardstick_loss = self.yardstick.loss(windows, delay, weight)
         yardstick_loss.backward()
         self.yardstick_optimizer.step()
         return (th.stack((loss, yardstick_loss)).detach(),)
@@ -217,19 +216,19 @@ class PlannerTrainer:
         regression's. The planner decodes with its averaged weights, one candidate and temperature 0.
         """
         self._check_finite()
-        metrics = {}
+        metrics, normalize = {}, self.planner.normalizer.normalize_states
         for d, windows in self._held_out.items():
-            delay = th.full((len(windows.states),), d, device=self.device)
-            observed, actions, _, truth, _ = self._yardstick_batch(windows, delay)
-            guess = self.yardstick(observed, actions, delay)
-            history = self._action_history(windows.actions, delay)
-            plan = self.planner.plan(windows.states[:, 0], history, delay, temperature=0.0)
-            for name, present in (
-                ("", Present(self.planner.normalizer.normalize_states(plan.present), plan.action)),
-                ("_mlp", Present(guess.state, guess.action.clamp(-1.0, 1.0))),
+            states, actions = windows.states, windows.actions
+            delay = th.full((len(states),), d, device=self.device)
+            history = F.pad(actions[:, :d], (0, 0, self.planner.max_delay - d, 0))  # (B, D, act_dim), as an agent has
+            plan = self.planner.plan(states[:, 0], history, delay, temperature=0.0)
+            present, decision = self.yardstick(normalize(states[:, 0]), actions, delay)
+            for name, state, action in (
+                ("", normalize(plan.present), plan.action),
+                ("_mlp", present, decision.clamp(-1.0, 1.0)),
             ):
-                metrics[f"planner/present_error{name}_d{d}"] = (present.state - truth.state).abs().mean().item()
-                metrics[f"planner/action_error{name}_d{d}"] = (present.action - truth.action).abs().mean().item()
+                metrics[f"planner/present_error{name}_d{d}"] = (state - normalize(states[:, d])).abs().mean().item()
+                metrics[f"planner/action_error{name}_d{d}"] = (action - actions[:, d]).abs().mean().item()
         return metrics
 
     def state_dict(self) -> dict[str, Any]:
@@ -239,9 +238,9 @@ class PlannerTrainer:
             {
                 "settings": self._settings,
                 "n_updates": self.n_updates,
-                **{name: dict(module.state_dict()) for name, module in self._modules().items()},
+                **{name: dict(module.state_dict()) for name, module in self._modules.items()},
                 # Of optimizers the state alone: their groups hold nothing but settings
-                **{name: optimizer.state_dict()["state"] for name, optimizer in self._optimizers().items()},
+                **{name: optimizer.state_dict()["state"] for name, optimizer in self._optimizers.items()},
                 "generator": self.generator.get_state(),
                 "loss_sums": self._loss_sums,
                 "n_losses": self._n_losses,
@@ -263,9 +262,9 @@ class PlannerTrainer:
             )
         state = copy.deepcopy(state)
         self.n_updates = state["n_updates"]
-        for name, module in self._modules().items():
+        for name, module in self._modules.items():
             module.load_state_dict(state[name])
-        for name, optimizer in self._optimizers().items():
+        for name, optimizer in self._optimizers.items():
             optimizer.load_state_dict({**optimizer.state_dict(), "state": state[name]})
         self.generator.set_state(state["generator"].cpu())
         self._loss_sums.copy_(state["loss_sums"])
@@ -274,23 +273,9 @@ class PlannerTrainer:
         if self._recorded is not None:
             self._recorded.forget()  # it writes to the optimizer state that was replaced
 
-    def _modules(self) -> dict[str, th.nn.Module]:
-        return {"planner": self.planner, "online": self.online, "yardstick": self.yardstick}
-
-    def _optimizers(self) -> dict[str, th.optim.Optimizer]:
-        return {"optimizer": self.optimizer, "yardstick_optimizer": self.yardstick_optimizer}
-
     def _rate(self, rate: float) -> float | th.Tensor:
         """Return a learning rate as the optimizers take it: on a GPU a tensor, so that a recorded update reads it."""
         return th.tensor(rate, device=self.device) if self.device.type == "cuda" else rate
-
-    @staticmethod
-    def _set_rate(optimizer: th.optim.Optimizer, rate: float) -> None:
-        for group in optimizer.param_groups:
-            if isinstance(group["lr"], th.Tensor):
-                group["lr"].fill_(rate)
-            else:
-                group["lr"] = rate
 
     def _check_finite(self) -> None:
         bad = int(self._bad_update)
@@ -300,21 +285,6 @@ class PlannerTrainer:
                 f"infinite values; else lower learning_rate ({self.config.learning_rate}) or lengthen warmup_steps "
                 f"({self.config.warmup_steps})."
             )
-
-    def _yardstick_batch(
-        self, windows: Windows, delay: th.Tensor
-    ) -> tuple[th.Tensor, th.Tensor, th.Tensor, Present, th.Tensor]:
-        index = th.arange(len(delay), device=self.device)
-        states = self.planner.normalizer.normalize_states(windows.states)  # (B, L, obs_dim)
-        present = Present(states[index, delay], windows.actions[index, delay])
-        return states[:, 0], windows.actions, delay, present, windows.valid[index, delay]
-
-    def _action_history(self, actions: th.Tensor, delay: th.Tensor) -> th.Tensor:
-        """Return what an agent would hold: (B, D, act_dim) with the d known actions last."""
-        D = self.planner.max_delay
-        source = th.arange(D, device=self.device) - (D - delay[:, None])  # (B, D): the window's index, < 0 if before it
-        history = actions.gather(1, source.clamp_min(0)[..., None].expand(-1, -1, actions.shape[-1]))
-        return history * (source >= 0)[..., None]
 
     def _draw_held_out(self, source: WindowSource, seed: int) -> dict[int, Windows]:
         """Return windows of every delay that the planner is trained for; a delay longer than all episodes has none."""

@@ -1,4 +1,4 @@
-"""What a training window weighs: the return to go of its first state, on a scale from 0 to 1, in an exponential."""
+"""The weight of a training window: an exponential of the scaled return to go of its first state."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import torch as th
 
-from sb3_said.planner.checks import check_choice
 from sb3_said.replay.windows import WindowSource
 
 VALUE_SCALES = ("rank", "range")
@@ -60,9 +59,7 @@ def scaled_values(values: th.Tensor, scale: str) -> th.Tensor:
     :param values: (M,)
     :param scale: ``"range"``, the place between the lowest and the highest (paper), ones where all are equal; or
         ``"rank"``, the part of the others that a value is above, equal ones counted half
-    :raises ValueError: for another scale
     """
-    check_choice("scale", scale, VALUE_SCALES)
     if scale == "range":
         low, high = values.min(), values.max()
         return th.ones_like(values) if low == high else (values - low) / (high - low)

@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch as th
 from torch import nn
 from torch.nn import functional as F
 
-
-class Present(NamedTuple):
-    """What hides behind a delay of d steps: the present, and the decision taken in it."""
-
-    state: th.Tensor  # (B, obs_dim) s_t, normalised
-    action: th.Tensor  # (B, act_dim) a_t, in environment units
+from sb3_said.replay.windows import Windows
 
 
 class RegressionYardstick(nn.Module):
     """Multi-layer perceptron from (s_{t-d}, the d actions since, d) to (s_t, a_t).
 
-    A generative planner has to know the present at least as well as this small network does. One that does not is not
-    trained enough, or wrong, whatever its return says.
+    A generative planner should know the present at least as well as this small network. One that does not is trained
+    too little, or wrong, whatever its return.
 
-    :param obs_dim: size of an observation
-    :param act_dim: size of an action
     :param max_delay: D, the largest delay
     :param hidden: width of the two hidden layers
     """
@@ -40,8 +31,8 @@ class RegressionYardstick(nn.Module):
             nn.Linear(hidden, obs_dim + act_dim),
         )
 
-    def forward(self, state: th.Tensor, actions: th.Tensor, delay: th.Tensor) -> Present:
-        """Predict the present.
+    def forward(self, state: th.Tensor, actions: th.Tensor, delay: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Predict the present (B, obs_dim), normalised, and the decision (B, act_dim), in environment units.
 
         :param state: (B, obs_dim) s_{t-d}, normalised
         :param actions: (B, >= D, act_dim) the window's actions in environment units; those from index d on are not read
@@ -49,24 +40,19 @@ class RegressionYardstick(nn.Module):
         """
         known = th.arange(self.max_delay, device=delay.device) < delay[:, None]  # (B, D)
         history = actions[:, : self.max_delay] * known[..., None]  # (B, D, act_dim)
-        return Present(*self.net(th.cat([state, history.flatten(1), known], dim=1)).split(self.sizes, dim=1))
+        present, decision = self.net(th.cat([state, history.flatten(1), known], dim=1)).split(self.sizes, dim=1)
+        return present, decision
 
-    def loss(
-        self,
-        state: th.Tensor,
-        actions: th.Tensor,
-        delay: th.Tensor,
-        target: Present,
-        valid: th.Tensor,
-        weight: th.Tensor,
-    ) -> th.Tensor:
-        """Return the mean squared error over states plus that over actions.
+    def loss(self, windows: Windows, delay: th.Tensor, weight: th.Tensor) -> th.Tensor:
+        """Return the mean squared error over states plus that over actions, where the episode reaches the decision.
 
-        :param target: the true present
-        :param valid: (B,) bool, False where the episode ended before the decision
+        :param windows: B windows with normalised states
+        :param delay: (B,) int64, d
         :param weight: (B,) factor of each window's error, as in the planner's loss
         """
-        guess = self(state, actions, delay)
-        error = F.mse_loss(guess.state, target.state, reduction="none").mean(1)  # (B,)
-        error = error + F.mse_loss(guess.action, target.action, reduction="none").mean(1)
+        at_decision = th.arange(len(delay), device=delay.device), delay
+        present, decision = self(windows.states[:, 0], windows.actions, delay)
+        error = F.mse_loss(present, windows.states[at_decision], reduction="none").mean(1)  # (B,)
+        error = error + F.mse_loss(decision, windows.actions[at_decision], reduction="none").mean(1)
+        valid = windows.valid[at_decision]
         return (error * valid * weight).sum() / valid.sum().clamp_min(1)

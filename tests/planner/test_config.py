@@ -40,6 +40,7 @@ def test_config_survives_json():
         ({"mask": "block"}, "mask is 'block'"),
         ({"action_transform": "log"}, "action_transform is 'log'"),
         ({"scored_states": "past"}, "scored_states is 'past'"),
+        ({"value_scale": "log"}, "value_scale is 'log'"),
         ({"precision": "half"}, "precision is 'half'"),
         ({"lr_schedule": "step"}, "lr_schedule is 'step'"),
         ({"horizon": 1}, "horizon is 1, expected at least 2"),

@@ -63,7 +63,7 @@ def test_linear_schedule_matches_the_numbers_of_the_paper_code():
 def test_predictions_give_back_what_the_sample_was_made_of(prediction, t, clean, noise, schedule):
     clean, noise, t = (th.tensor(value, dtype=th.float64) for value in (clean, noise, t))
     alpha, sigma = diffusion.alpha_sigma(t, schedule)
-    x = diffusion.add_noise(clean, noise, alpha, sigma)
+    x = alpha * clean + sigma * noise
     target = diffusion.prediction_target(clean, noise, alpha, sigma, prediction)
     th.testing.assert_close(diffusion.to_clean(target, x, alpha, sigma, prediction), clean, atol=1e-9, rtol=1e-9)
 
@@ -150,17 +150,6 @@ def test_impose_holds_before_every_step_and_at_the_end():
     assert seen == [7.0] * 4 and result[0] == 7.0
 
 
-def test_wrong_names_and_numbers_are_refused():
-    t = th.tensor([0.5])
-    for call in (
-        lambda: diffusion.alpha_sigma(t, "quadratic"),
-        lambda: diffusion.prediction_target(t, t, t, t, "score"),
-        lambda: diffusion.to_clean(t, t, 1.0, 0.0, "score"),
-        lambda: diffusion.draw_times(1, "cosine", "beta"),
-        lambda: diffusion.draw_times(1, "quadratic", "uniform"),
-        lambda: diffusion.solver_steps("quadratic", 5),
-    ):
-        with pytest.raises(ValueError, match="expected one of"):
-            call()
+def test_a_number_of_steps_below_1_is_refused():
     with pytest.raises(ValueError, match="is 0, expected at least 1"):
         diffusion.solver_steps("cosine", 0)

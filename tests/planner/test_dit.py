@@ -145,8 +145,3 @@ def test_order_and_time_matter():
     context = network.context(x, th.zeros_like(known))
     output, flipped = (network(inputs, context, network.modulations(t)) for inputs in (x, x.flip(1)))
     assert (flipped.flip(1) - output).abs().max() > 0.01
-
-
-def test_bad_arguments_are_refused():
-    with pytest.raises(ValueError, match=r"d_model is 48, .* multiple of 32"):
-        DiT1d(OBS, ACT, DELAY, LENGTH, d_model=48)

@@ -73,8 +73,3 @@ def test_random_lengths_have_the_stated_distribution():
 def test_fixed_lengths_and_no_delay():
     assert draw_delays(5, 4, "fixed", 0.5).tolist() == [4] * 5
     assert draw_delays(5, 0, "random", 0.5).tolist() == [0] * 5
-
-
-def test_unknown_mask_is_refused():
-    with pytest.raises(ValueError, match=r"mask is 'block', expected one of \('random', 'fixed'\)"):
-        draw_delays(5, 4, "block")

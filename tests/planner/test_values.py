@@ -93,11 +93,6 @@ def test_scaled_values_are_within_zero_and_one_and_in_order(scale, values):
     assert (scaled[values.argsort()].diff() >= 0).all()
 
 
-def test_unknown_scales_are_refused():
-    with pytest.raises(ValueError, match="scale is 'log', expected one of"):
-        scaled_values(th.ones(2), "log")
-
-
 def test_window_weight_is_the_papers():
     values = th.tensor([0.0, 0.25, 1.0])
     expected = [math.exp(-2.0), math.exp(-1.5), 1.0]
