@@ -5,29 +5,19 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 
 from sb3_said.evaluation.statistics import Latency
 
+if TYPE_CHECKING:
+    from stable_baselines3.common.type_aliases import PolicyPredictor
+
 Observation = Any  # one array, or a dict of arrays; batched with a leading axis where a docstring says (B, ...)
 EnvMaker = str | Callable[[], gym.Env[Any, Any]]
 State = tuple[np.ndarray, ...] | None
-
-
-class Model(Protocol):
-    """Anything with the ``predict`` of Stable-Baselines3."""
-
-    def predict(
-        self,
-        observation: Observation,
-        state: State = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, State]:
-        """Answer a batch of observations (B, ...) with actions (B, act_dim)."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +35,7 @@ class Rollout:
 
 
 def rollout(
-    model: Model,
+    model: PolicyPredictor,
     env: EnvMaker,
     n_episodes: int,
     seed: int,
@@ -139,7 +129,7 @@ def collect_observations(env: EnvMaker, n_observations: int, seed: int) -> Obser
 
 
 def measure_latency(
-    model: Model,
+    model: PolicyPredictor,
     observations: Observation,
     n_calls: int = 200,
     deterministic: bool = True,
@@ -195,7 +185,7 @@ def _stack(observations: list[Observation]) -> Observation:
     return np.stack(observations)
 
 
-def _keep_rows(model: Model, state: State, rows: list[int]) -> State:
+def _keep_rows(model: PolicyPredictor, state: State, rows: list[int]) -> State:
     """Keep the rows of the environments that go on; in sb3_contrib's recurrent states they are on axis 1."""
     if state is None:
         return None
