@@ -228,8 +228,7 @@ def packet_delays(delay: Delay, rng: np.random.Generator) -> Iterator[int | None
     """Draw an episode: the delays of the packets sent at steps 1, 2, ...; None for one that is lost.
 
     :return: an ``itertools.repeat`` where all packets of the episode take equally long
-    :raises ValueError: when the process draws anything but integers in 0..max_delay, or when its delays end; at once,
-        or when the draw is reached
+    :raises ValueError: for anything but integers in 0..max_delay, or when the delays end; the iterator raises it too
     """
     process = as_process(delay)
     drawn = process.sample(rng)

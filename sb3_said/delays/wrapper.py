@@ -122,9 +122,10 @@ class DelayedObservationWrapper(
         space = delayed_space(obs_space, act_space, self.max_delay, state_history)
         self.observation_space = space  # type: ignore[assignment]  # a Dict is a Space[dict[str, Any]]
         self._rng = np.random.default_rng()
-        self._actions = np.zeros((self.max_delay, *act_space.shape), np.float32)  # a_{t-D..t-1}
-        self._states = np.zeros((self.max_delay + 1, *obs_space.shape), np.float32)  # s_{t-D..t}
-        self._known = np.zeros(self.max_delay + 1, np.float32)  # which of these were handed out
+        n = self.max_delay + 1
+        self._actions = np.zeros((n, *act_space.shape), np.float32)  # a_{t-D-1..t-1}, each beside the state it led to
+        self._states = np.zeros((n, *obs_space.shape), np.float32)  # s_{t-D..t}
+        self._known = np.zeros(n, np.float32)  # which of these were handed out
 
     @property
     def age_range(self) -> tuple[int, int]:
@@ -158,8 +159,7 @@ class DelayedObservationWrapper(
         state: Any
         executed = action if self.actuator is None else self.actuator.execute(action)
         state, reward, terminated, truncated, info = self.env.step(executed)
-        if self.max_delay > 0:
-            _append(self._actions, self._scale(action))
+        _append(self._actions, self._scale(action))
         age = self.receiver.step()
         lag, shown = (0, None) if self.actuator is None else (self.actuator.lag(age), executed)
         return self._observe(state, age, lag), reward, terminated, truncated, self._with_own(info, shown)
@@ -171,7 +171,7 @@ class DelayedObservationWrapper(
         self._known[-1 - age] = 1.0
         obs = {
             "observation": self._states[-1 - age].copy(),
-            "action_history": self._actions.copy(),
+            "action_history": self._actions[1:].copy(),
             "delay": np.array([age + lag], dtype=np.float32),
         }
         if self.state_history:

@@ -17,7 +17,6 @@ from sb3_said.evaluation.statistics import Interval, Summary, bootstrap_interval
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 # Okabe and Ito's palette: told apart by colour-blind readers too.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -52,7 +51,7 @@ def panels(n: int = 1, width: float = 5.0, height: float = 3.6) -> list[Axes]:
 def save(ax: Axes, path: str | Path) -> None:
     """Write the figure of ``ax``; the file's suffix names the format (.png, .pdf, .svg)."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    _figure(ax).savefig(path)
+    ax.get_figure(root=True).savefig(path)  # type: ignore[union-attr]  # all axes of `panels` have one
 
 
 def plot_learning_curve(run: str | Path, ax: Axes | None = None, window: int = 20) -> Axes:
@@ -147,7 +146,7 @@ def plot_over_delays(table: Mapping[str, Mapping[int | str, Summary]]) -> list[A
     axes[0].autoscale_view()  # sharing alone leaves the limits of the first
     axes[0].set_ylabel("return of an episode (undiscounted)")
     handles, labels = axes[0].get_legend_handles_labels()
-    _figure(axes[0]).legend(handles, labels, loc="outside upper center", ncols=len(kinds), frameon=False)
+    axes[0].figure.legend(handles, labels, loc="outside upper center", ncols=len(kinds), frameon=False)
     return axes
 
 
@@ -202,12 +201,6 @@ def plot_planner_errors(run: str | Path, kind: Literal["present", "action"], ax:
 def _bounds(intervals: Sequence[Interval]) -> np.ndarray:
     """Return values, lower and upper bounds: (3, n)."""
     return np.array([(i.value, i.low, i.high) for i in intervals]).reshape(-1, 3).T
-
-
-def _figure(ax: Axes) -> Figure:
-    figure = ax.get_figure(root=True)
-    assert figure is not None  # for mypy: axes of `panels` have one
-    return figure
 
 
 def _in_lines(name: str) -> str:
