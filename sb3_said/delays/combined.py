@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sb3_said.delays.processes import (
+    BaseProcess,
     Delay,
     as_process,
     check_probability,
@@ -19,21 +20,14 @@ from sb3_said.delays.processes import (
 
 
 @dataclass(frozen=True)
-class _OfProcess:
+class _OfProcess(BaseProcess):
     """A process made of one other process."""
 
     process: Delay
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "process", as_process(self.process))
-
-    @property
-    def min_delay(self) -> int:
-        return smallest_age(self.process)
-
-    @property
-    def max_delay(self) -> int:
-        return as_process(self.process).max_delay
+        process = as_process(self.process)
+        self._set(process=process, min_delay=smallest_age(process), max_delay=process.max_delay)
 
 
 @dataclass(frozen=True)
@@ -55,24 +49,18 @@ class HeldDelay(_OfProcess):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_probability("hold_prob", self.hold_prob)
-        object.__setattr__(self, "update_period", checked_count("update_period", self.update_period, 1))
+        self._set(update_period=checked_count("update_period", self.update_period, 1))
 
     def sample(self, rng: np.random.Generator) -> Iterator[int | None]:
-        delays = self._draws(rng)
         phase = int(rng.integers(self.update_period))
+        delays = packet_delays(self.process, rng)
         delay = next(delays)
-        for packet in itertools.count(1):
+        for packet in itertools.count(phase + 1):
             yield delay
-            if (packet + phase) % self.update_period == 0 and rng.random() >= self.hold_prob:
+            if packet % self.update_period == 0 and rng.random() >= self.hold_prob:
+                if isinstance(delays, itertools.repeat):
+                    delays = packet_delays(self.process, rng)
                 delay = next(delays)
-
-    def _draws(self, rng: np.random.Generator) -> Iterator[int | None]:
-        while True:
-            delays = packet_delays(self.process, rng)
-            if isinstance(delays, itertools.repeat):
-                yield next(delays)
-            else:
-                yield from delays  # without an end
 
 
 @dataclass(frozen=True)
@@ -90,11 +78,8 @@ class PeriodicPackets(_OfProcess):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "period", checked_count("period", self.period, 1))
-
-    @property
-    def max_delay(self) -> int:
-        return super().max_delay + self.period - 1
+        period = checked_count("period", self.period, 1)
+        self._set(period=period, max_delay=self.max_delay + period - 1)
 
     def sample(self, rng: np.random.Generator) -> Iterator[int | None]:
         for delay in packet_delays(self.process, rng):
@@ -124,11 +109,8 @@ class DroppedPackets(_OfProcess):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_probability("p", self.p)
-        object.__setattr__(self, "max_losses", checked_count("max_losses", self.max_losses, 1))
-
-    @property
-    def max_delay(self) -> int:
-        return super().max_delay + self.max_losses
+        max_losses = checked_count("max_losses", self.max_losses, 1)
+        self._set(max_losses=max_losses, max_delay=self.max_delay + max_losses)
 
     def sample(self, rng: np.random.Generator) -> Iterator[int | None]:
         for delay in packet_delays(self.process, rng):
@@ -136,7 +118,7 @@ class DroppedPackets(_OfProcess):
 
 
 @dataclass(frozen=True)
-class TotalDelay:
+class TotalDelay(BaseProcess):
     """Observation delay plus action delay: ``delay`` and ``action_delay`` of the wrapper in one, as on a command line.
 
     An action that takes k steps to the actuator meets the state k steps on. On the actuator's clock, each action is
@@ -151,16 +133,9 @@ class TotalDelay:
     action: Delay
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "observation", as_process(self.observation))
-        object.__setattr__(self, "action", as_process(self.action))
-
-    @property
-    def min_delay(self) -> int:
-        return smallest_age(self.observation) + smallest_age(self.action)
-
-    @property
-    def max_delay(self) -> int:
-        return as_process(self.observation).max_delay + as_process(self.action).max_delay
+        observation, action = as_process(self.observation), as_process(self.action)
+        low, high = smallest_age(observation) + smallest_age(action), observation.max_delay + action.max_delay
+        self._set(observation=observation, action=action, min_delay=low, max_delay=high)
 
     @property
     def action_varies(self) -> bool:

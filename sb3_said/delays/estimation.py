@@ -105,18 +105,24 @@ def _rows(
 
     :return: (o_t, o_t - o_{t-1}, 1), (N, features); o_{t+1} - o_t, (N, obs_dim); and a_t, ..., a_{t-max_delay},
         (max_delay + 1, N, act_dim)
+    :raises ValueError: for observations or actions that never change
     """
-    before, change, lagged = [], [], []
     all_sent = np.concatenate(actions)
-    mean, scale, varies = all_sent.mean(0), all_sent.std(0), _varies(all_sent)  # (act_dim,) each
-    for o, sent in zip(observations, actions, strict=True):  # (T + 1, obs_dim), (T, act_dim)
-        step = np.diff(o, axis=0)  # (T, obs_dim)
+    mean, scale = all_sent.mean(0), all_sent.std(0)  # (act_dim,)
+    varies = scale > ROUNDING * np.abs(all_sent).max(0, initial=0.0)
+    if not varies.any():
+        raise ValueError("The actions never change; log the system while it is given different actions.")
+    size = np.abs(np.concatenate(observations)).max(0)  # (obs_dim,)
+    steps = [np.diff(o, axis=0) for o in observations]  # (T, obs_dim)
+    if not np.any(np.abs(np.concatenate(steps)) > ROUNDING * size):
+        raise ValueError("The observations never change: none arrived, or the log is of another system.")
+    before, change, lagged = [], [], []
+    for o, step, sent in zip(observations, steps, actions, strict=True):
         t = 1 + np.flatnonzero(np.any(step[1:] != 0, axis=1))
         before.append(np.hstack([o[t], step[t - 1]]))
         change.append(step[t])
         a = np.concatenate([np.zeros((max_delay, sent.shape[1])), sent - mean])
         lagged.append(a[max_delay + t - np.arange(max_delay + 1)[:, None]])  # (max_delay + 1, n, act_dim)
-    size = np.abs(np.concatenate(observations)).max(0)  # (obs_dim,)
     x, y = _standardise(np.concatenate(before), np.tile(size, 2)), _standardise(np.concatenate(change), size)
     a = np.concatenate(lagged, axis=1)
     return np.hstack([x, np.ones((len(x), 1))]), y, a[..., varies] / scale[varies]
@@ -131,11 +137,6 @@ def _standardise(x: np.ndarray, size: np.ndarray) -> np.ndarray:
         return x
     x = x[:, x.std(0) > ROUNDING * size]
     return np.clip((x - x.mean(0)) / x.std(0), -4.0, 4.0)
-
-
-def _varies(x: np.ndarray) -> np.ndarray:
-    """Tell which columns vary by more than rounding: (dim,)."""
-    return x.std(0) > ROUNDING * np.abs(x).max(0, initial=0.0)
 
 
 def _held_out_gains(x: np.ndarray, y: np.ndarray, lagged: np.ndarray, fold: np.ndarray) -> np.ndarray:
@@ -162,10 +163,7 @@ def _residuals(x: np.ndarray, targets: list[np.ndarray], kept: np.ndarray) -> li
 
 
 def _check_episodes(observations: Sequence[np.ndarray], actions: Sequence[np.ndarray]) -> None:
-    """Refuse a log whose arrays do not fit together, are not finite or never change.
-
-    :raises ValueError: saying which episode
-    """
+    """Refuse a log whose arrays do not fit together or are not finite with a ``ValueError``."""
     if len(observations) != len(actions) or len(actions) == 0:
         raise ValueError(
             "estimate_delay takes one array of observations and one of actions for each episode, at least one, "
@@ -180,8 +178,3 @@ def _check_episodes(observations: Sequence[np.ndarray], actions: Sequence[np.nda
             )
         if not (np.all(np.isfinite(o)) and np.all(np.isfinite(a))):
             raise ValueError(f"Episode {i} has observations or actions that are not finite.")
-    if not _varies(np.concatenate(actions)).any():
-        raise ValueError("The actions never change; log the system while it is given different actions.")
-    size = np.abs(np.concatenate(observations)).max(0)  # (obs_dim,)
-    if not any(np.any(np.abs(np.diff(o, axis=0)) > ROUNDING * size) for o in observations):
-        raise ValueError("The observations never change: none arrived, or the log is of another system.")

@@ -9,17 +9,14 @@ from __future__ import annotations
 import bisect
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 import numpy as np
 
 
 class DelayProcess(Protocol):
-    """Draws how many control steps the packets of an episode take.
-
-    ``min_delay``, the smallest age amid an episode, is optional: see :func:`smallest_age`.
-    """
+    """Draws how many control steps the packets of an episode take; see :func:`smallest_age` for ``min_delay``."""
 
     @property
     def max_delay(self) -> int:
@@ -38,7 +35,20 @@ Delay = int | Sequence[int] | DelayProcess
 
 
 @dataclass(frozen=True)
-class FixedDelay:
+class BaseProcess:
+    """What the processes of this package share: the smallest and the largest age amid an episode."""
+
+    min_delay: int = field(init=False, repr=False, compare=False)
+    max_delay: int = field(init=False, repr=False, compare=False)
+
+    def _set(self, **values: Any) -> None:
+        """Set fields of the frozen instance, from ``__post_init__`` only."""
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+
+@dataclass(frozen=True)
+class FixedDelay(BaseProcess):
     """The same delay in every episode.
 
     :param delay: in control steps, >= 0
@@ -50,22 +60,15 @@ class FixedDelay:
     def __post_init__(self) -> None:
         if not (_is_integer(self.delay) and self.delay >= 0):
             raise ValueError(f"A delay is a whole number of control steps >= 0, got {self.delay}.")
-        object.__setattr__(self, "delay", int(self.delay))
-
-    @property
-    def min_delay(self) -> int:
-        return self.delay
-
-    @property
-    def max_delay(self) -> int:
-        return self.delay
+        delay = int(self.delay)
+        self._set(delay=delay, min_delay=delay, max_delay=delay)
 
     def sample(self, rng: np.random.Generator) -> int:
         return self.delay
 
 
 @dataclass(frozen=True)
-class _Range:
+class _Range(BaseProcess):
     """A process over ``low..high``."""
 
     low: int
@@ -76,16 +79,8 @@ class _Range:
             raise ValueError(
                 f"A delay range is (low, high), whole numbers with 0 <= low <= high, got ({self.low}, {self.high})."
             )
-        object.__setattr__(self, "low", int(self.low))
-        object.__setattr__(self, "high", int(self.high))
-
-    @property
-    def min_delay(self) -> int:
-        return self.low
-
-    @property
-    def max_delay(self) -> int:
-        return self.high
+        low, high = int(self.low), int(self.high)
+        self._set(low=low, high=high, min_delay=low, max_delay=high)
 
 
 @dataclass(frozen=True)
@@ -111,7 +106,7 @@ class UniformDelay(_Range):
 
 
 @dataclass(frozen=True)
-class DistributionDelay:
+class DistributionDelay(BaseProcess):
     """A delay drawn for every packet from any distribution P(t) over 0..D (the DOMDP of the paper, section 2).
 
     :param probabilities: P(0), P(1), ..., P(D)
@@ -129,7 +124,9 @@ class DistributionDelay:
             raise ValueError(
                 f"The probabilities of the delays 0, 1, 2, ... are >= 0 and add up to 1, got {self.probabilities}."
             )
-        object.__setattr__(self, "probabilities", tuple(p.tolist()))  # a list (from YAML) has no hash
+        occurs = np.flatnonzero(p).tolist()
+        # A tuple, since a list (from YAML) has no hash.
+        self._set(probabilities=tuple(p.tolist()), min_delay=occurs[0], max_delay=occurs[-1])
 
     @classmethod
     def from_samples(cls, delays: Sequence[int] | np.ndarray) -> DistributionDelay:
@@ -145,14 +142,6 @@ class DistributionDelay:
                 "in_steps(milliseconds, control_period) makes them."
             )
         return cls(tuple(np.bincount(drawn) / len(drawn)))
-
-    @property
-    def min_delay(self) -> int:
-        return int(np.flatnonzero(self.probabilities)[0])
-
-    @property
-    def max_delay(self) -> int:
-        return int(np.flatnonzero(self.probabilities)[-1])
 
     def sample(self, rng: np.random.Generator) -> Iterator[int]:
         cumulative = list(itertools.accumulate(self.probabilities[: self.max_delay]))
@@ -230,55 +219,44 @@ def as_process(delay: Delay) -> DelayProcess:
     )
 
 
-def smallest_age(delay: Delay) -> int:
-    """Return the smallest age amid an episode, in control steps: 0 for a user's own process without ``min_delay``.
-
-    An episode's start has smaller ones.
-    """
-    return getattr(as_process(delay), "min_delay", 0)
+def smallest_age(process: DelayProcess) -> int:
+    """Return the smallest age amid an episode, in control steps: 0 for a user's own process without ``min_delay``."""
+    return getattr(process, "min_delay", 0)
 
 
 def packet_delays(delay: Delay, rng: np.random.Generator) -> Iterator[int | None]:
     """Draw an episode: the delays of the packets sent at steps 1, 2, ...; None for one that is lost.
 
     :return: an ``itertools.repeat`` where all packets of the episode take equally long
-    :raises ValueError: when the process draws anything but integers in 0..max_delay, or when its delays end; at once,
-        or when the draw is reached
+    :raises ValueError: for anything but integers in 0..max_delay, or when the delays end; the iterator raises it too
     """
     process = as_process(delay)
     drawn = process.sample(rng)
     if isinstance(drawn, Iterator):
         return _checked(process, drawn)
-    return itertools.repeat(_checked_draw(process, drawn, process.max_delay))
+    return itertools.repeat(_checked_draw(process, drawn))
 
 
 def _checked(process: DelayProcess, delays: Iterator[int | None]) -> Iterator[int | None]:
-    max_delay = process.max_delay
     for delay in delays:
-        yield None if delay is None else _checked_draw(process, delay, max_delay)
+        yield None if delay is None else _checked_draw(process, delay)
     raise ValueError(f"{process!r} ran out of delays amid an episode; its iterator must have no end.")
 
 
-def _checked_draw(process: DelayProcess, delay: int, max_delay: int) -> int:
-    if not (_is_integer(delay) and 0 <= delay <= max_delay):
-        raise ValueError(f"{process!r} drew a delay of {delay}, expected a whole number in 0..{max_delay}.")
+def _checked_draw(process: DelayProcess, delay: int) -> int:
+    if not (_is_integer(delay) and 0 <= delay <= process.max_delay):
+        raise ValueError(f"{process!r} drew a delay of {delay}, expected a whole number in 0..{process.max_delay}.")
     return int(delay)
 
 
 def check_probability(name: str, p: float) -> None:
-    """Refuse a number outside 0..1.
-
-    :raises ValueError: with the number
-    """
+    """Refuse a number outside 0..1 with a ``ValueError``."""
     if not 0.0 <= p <= 1.0:
         raise ValueError(f"{name} is a probability in 0..1, got {p}.")
 
 
 def checked_count(name: str, n: int, smallest: int) -> int:
-    """Return a whole number as Python's own ``int``; ``in_steps`` returns NumPy's.
-
-    :raises ValueError: for anything but a whole number of at least ``smallest``
-    """
+    """Return a whole number as an ``int``; refuse anything else, and less than ``smallest``, with a ``ValueError``."""
     if not (_is_integer(n) and n >= smallest):
         raise ValueError(f"{name} is a whole number >= {smallest}, got {n}.")
     return int(n)

@@ -25,11 +25,7 @@ class NewestPacket:
         self._arriving = [0] * (process.max_delay + 1)  # the newest packet due at t, at t % (max_delay + 1)
 
     def reset(self, rng: np.random.Generator) -> None:
-        """Start an episode: packet 0 is there, with age 0.
-
-        :param rng: of the process, until the next reset
-        :raises ValueError: when the process draws a delay outside 0..max_delay
-        """
+        """Start an episode: packet 0 is there, with age 0. Until the next reset, ``rng`` draws the delays."""
         self._delays: Iterator[int | None] = packet_delays(self.process, rng)
         self._arriving = [0] * len(self._arriving)
         self._step = self._newest = 0
@@ -37,11 +33,7 @@ class NewestPacket:
         self.forced_deliveries = 0
 
     def step(self) -> int:
-        """Send the next packet.
-
-        :return: the age of the newest packet, in control steps
-        :raises ValueError: when the process draws a delay outside 0..max_delay
-        """
+        """Send the next packet, and return the age of the one that is held now, in control steps."""
         self._step += 1
         self._newest = self._read(next(self._delays))
         if self._step - self._newest == len(self._arriving):
@@ -50,7 +42,7 @@ class NewestPacket:
         return self._step - self._newest
 
     def _read(self, delay: int | None) -> int:
-        """Send the packet of this step, and return the number of the packet that is held now."""
+        """Send the packet of this step, and return the number of the one that is held now."""
         n_slots = len(self._arriving)
         if delay is not None:
             self._arriving[(self._step + delay) % n_slots] = self._step
@@ -89,30 +81,19 @@ class Actuator:
         self._ages: deque[int] = deque(maxlen=int(memory) + 1)  # of what was executed in the newest steps
 
     def reset(self, rng: np.random.Generator) -> None:
-        """Start an episode.
-
-        :param rng: of the action delays, until the next reset
-        """
+        """Start an episode. Until the next reset, ``rng`` draws the action delays."""
         self.receiver.reset(rng)
         self._sent.clear()
         self._ages.clear()
 
     def execute(self, action: np.ndarray) -> np.ndarray:
-        """Send an action to the actuator.
-
-        :param action: (act_dim,)
-        :return: the action that is executed in this step, sent now or earlier
-        """
+        """Send an action (act_dim,), and return the one that this step executes, sent now or earlier."""
         age = self.receiver.step() if self._sent else 0
         self._sent.append(np.array(action))
         self._ages.append(age)
         return self._sent[-1 - age]
 
     def lag(self, age: int) -> int:
-        """Return how many actions, sent before a state, do not show in it yet.
-
-        That is the age of the action whose execution led to the state. No action leads to s_0.
-
-        :param age: of the state, in control steps
-        """
+        """Return how many actions, sent before the state of an age, do not show in it yet."""
+        # That is the age of the action whose execution led to the state. No action leads to s_0.
         return self._ages[-1 - age] if age < len(self._ages) else 0

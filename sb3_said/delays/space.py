@@ -72,8 +72,7 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
     """
     state_space, max_delay = observation_space, 0
     if isinstance(observation_space, spaces.Dict):
-        keys = {*KEYS, *STATE_KEYS} if has_state_history(observation_space) else set(KEYS)
-        if set(observation_space.keys()) != keys:
+        if set(observation_space.keys()) not in (set(KEYS), {*KEYS, *STATE_KEYS}):
             raise ValueError(
                 f"Expected the dict observation of DelayedObservationWrapper ({', '.join(KEYS)}), "
                 f"got the keys {sorted(observation_space.keys())}; wrap the task in it."

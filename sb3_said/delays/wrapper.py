@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
@@ -123,10 +122,10 @@ class DelayedObservationWrapper(
         space = delayed_space(obs_space, act_space, self.max_delay, state_history)
         self.observation_space = space  # type: ignore[assignment]  # a Dict is a Space[dict[str, Any]]
         self._rng = np.random.default_rng()
-        self._states: deque[np.ndarray] = deque(maxlen=self.max_delay + 1)
-        self._history = np.zeros((self.max_delay, *act_space.shape), np.float32)
-        self._received = np.zeros((self.max_delay + 1, *obs_space.shape), np.float32)  # s_{t-D..t}, zeros where unknown
-        self._is_received = np.zeros(self.max_delay + 1, np.float32)
+        n = self.max_delay + 1
+        self._actions = np.zeros((n, *act_space.shape), np.float32)  # a_{t-D-1..t-1}, each beside the state it led to
+        self._states = np.zeros((n, *obs_space.shape), np.float32)  # s_{t-D..t}
+        self._known = np.zeros(n, np.float32)  # which of these were handed out
 
     @property
     def age_range(self) -> tuple[int, int]:
@@ -148,8 +147,7 @@ class DelayedObservationWrapper(
         if self.actuator is not None:
             self.actuator.reset(self._rng.spawn(1)[0])
         self.receiver.reset(self._rng)
-        self._states.clear()
-        self._history[:] = self._received[:] = self._is_received[:] = 0.0
+        self._actions[:] = self._states[:] = self._known[:] = 0.0
         return self._observe(state, age=0), self._with_own(info)
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict[str, Any]]:
@@ -161,30 +159,25 @@ class DelayedObservationWrapper(
         state: Any
         executed = action if self.actuator is None else self.actuator.execute(action)
         state, reward, terminated, truncated, info = self.env.step(executed)
-        if self.max_delay > 0:
-            self._history[:-1] = self._history[1:]
-            self._history[-1] = self._scale(action)
+        _append(self._actions, self._scale(action))
         age = self.receiver.step()
         lag, shown = (0, None) if self.actuator is None else (self.actuator.lag(age), executed)
         return self._observe(state, age, lag), reward, terminated, truncated, self._with_own(info, shown)
 
     def _observe(self, state: np.ndarray, age: int, lag: int = 0) -> dict[str, np.ndarray]:
         """Hand out the state of an age; ``lag`` actions sent before that state do not show in it yet."""
-        self._states.append(np.asarray(state, dtype=np.float32).copy())
+        _append(self._states, state)
+        _append(self._known, 0.0)
+        self._known[-1 - age] = 1.0
         obs = {
             "observation": self._states[-1 - age].copy(),
-            "action_history": self._history.copy(),
+            "action_history": self._actions[1:].copy(),
             "delay": np.array([age + lag], dtype=np.float32),
         }
-        return obs | self._remember(obs["observation"], age) if self.state_history else obs
-
-    def _remember(self, observation: np.ndarray, age: int) -> dict[str, np.ndarray]:
-        """Return all that was handed out, this observation included, in the rows of the actions that led there."""
-        for rows in (self._received, self._is_received):
-            rows[:-1] = rows[1:]
-            rows[-1] = 0.0
-        self._received[-1 - age], self._is_received[-1 - age] = observation, 1.0
-        return {"state_history": self._received[1:].copy(), "state_known": self._is_received[1:].copy()}
+        if self.state_history:
+            known = self._known[1:].copy()
+            obs |= {"state_history": np.where(known[:, None] == 1, self._states[1:], 0), "state_known": known}
+        return obs
 
     def _with_own(self, info: dict[str, Any], executed: np.ndarray | None = None) -> dict[str, Any]:
         """Return the task's info with this wrapper's entries, and without what it has under the same names."""
@@ -201,3 +194,9 @@ class DelayedObservationWrapper(
         if not self._action_is_scaled:
             action = 2.0 * ((action - self._action_low) / self._action_span) - 1.0
         return np.clip(action, -1.0, 1.0)
+
+
+def _append(rows: np.ndarray, row: np.ndarray | float) -> None:
+    """Drop the oldest row and write the newest, in place."""
+    rows[:-1] = rows[1:]
+    rows[-1] = row

@@ -17,7 +17,6 @@ from sb3_said.evaluation.statistics import Interval, Summary, bootstrap_interval
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 # Okabe and Ito's palette: told apart by colour-blind readers too.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -52,7 +51,7 @@ def panels(n: int = 1, width: float = 5.0, height: float = 3.6) -> list[Axes]:
 def save(ax: Axes, path: str | Path) -> None:
     """Write the figure of ``ax``; the file's suffix names the format (.png, .pdf, .svg)."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    _figure(ax).savefig(path)
+    ax.get_figure(root=True).savefig(path)  # type: ignore[union-attr]  # all axes of `panels` have one
 
 
 def plot_learning_curve(run: str | Path, ax: Axes | None = None, window: int = 20) -> Axes:
@@ -116,20 +115,38 @@ def plot_over_delays(table: Mapping[str, Mapping[int | str, Summary]]) -> list[A
     :return: a panel for each kind of delay there is, on one figure, with the same axis of returns
     :raises ValueError: for a table without a summary
     """
-    names = list(dict.fromkeys(delay for row in table.values() for delay in row))
-    randoms = [name for name in names if isinstance(name, str)]
-    kinds = [_plot_fixed_delays] * (len(randoms) < len(names)) + [_plot_random_delays] * bool(randoms)
+    delays = list(dict.fromkeys(delay for row in table.values() for delay in row))
+    fixed = sorted(delay for delay in delays if isinstance(delay, int))
+    random = [delay for delay in delays if isinstance(delay, str)]
+    kinds: list[Sequence[int | str]] = [kind for kind in (fixed, random) if kind]
     if not kinds:
         raise ValueError(f"Nothing was played, got {table}; give each agent a summary for some delay.")
     legend_rows = math.ceil(len(table) / len(kinds))
-    axes = panels(len(kinds), width=max(5.0, 1.3 * len(randoms)), height=3.4 + 0.2 * legend_rows)
-    for ax, plot in zip(axes, kinds, strict=True):
-        plot(table, ax)
+    axes = panels(len(kinds), width=max(5.0, 1.3 * len(random)), height=3.4 + 0.2 * legend_rows)
+    for ax, kind in zip(axes, kinds, strict=True):
+        for i, (agent, row) in enumerate(table.items()):
+            color, played = COLORS[i % len(COLORS)], [delay for delay in kind if delay in row]
+            offset = 0.7 * ((i + 0.5) / len(table) - 0.5)  # agents side by side at the tick of a random delay
+            x = played if kind is fixed else [kind.index(delay) + offset for delay in played]
+            value, low, high = _bounds([row[delay].mean_return for delay in played])
+            ax.errorbar(
+                x, value, yerr=[value - low, high - value], color=color, marker=MARKERS[i % len(MARKERS)],
+                markersize=5, elinewidth=1, capsize=2, linestyle="-" if kind is fixed else "none", label=agent,
+            )  # fmt: skip
+            if kind is fixed:
+                ax.fill_between(x, low, high, color=color, alpha=0.15, linewidth=0)
+        if kind is fixed:
+            ax.set_xticks(fixed)
+            ax.set_xlabel("delay (control steps)")
+        else:
+            ax.set_xticks(range(len(random)), [_in_lines(name) for name in random], fontsize="small")
+            ax.set_xlim(-0.5, len(random) - 0.5)
+            ax.set_xlabel("random delay")
         ax.sharey(axes[0])
     axes[0].autoscale_view()  # sharing alone leaves the limits of the first
     axes[0].set_ylabel("return of an episode (undiscounted)")
     handles, labels = axes[0].get_legend_handles_labels()
-    _figure(axes[0]).legend(handles, labels, loc="outside upper center", ncols=len(kinds), frameon=False)
+    axes[0].figure.legend(handles, labels, loc="outside upper center", ncols=len(kinds), frameon=False)
     return axes
 
 
@@ -181,49 +198,9 @@ def plot_planner_errors(run: str | Path, kind: Literal["present", "action"], ax:
     return ax
 
 
-def _plot_fixed_delays(table: Mapping[str, Mapping[int | str, Summary]], ax: Axes) -> None:
-    delays = sorted({delay for row in table.values() for delay in row if isinstance(delay, int)})
-    for i, (agent, row) in enumerate(table.items()):
-        played = [delay for delay in delays if delay in row]
-        means = [row[delay].mean_return for delay in played]
-        _plot_intervals(ax, i, agent, played, means, linestyle="-")
-        _, low, high = _bounds(means)
-        ax.fill_between(played, low, high, color=COLORS[i % len(COLORS)], alpha=0.15, linewidth=0)
-    ax.set_xticks(delays)
-    ax.set_xlabel("delay (control steps)")
-
-
-def _plot_random_delays(table: Mapping[str, Mapping[int | str, Summary]], ax: Axes) -> None:
-    names = list(dict.fromkeys(delay for row in table.values() for delay in row if isinstance(delay, str)))
-    for i, (agent, row) in enumerate(table.items()):
-        offset = 0.7 * ((i + 0.5) / len(table) - 0.5)
-        played = [(column + offset, row[name].mean_return) for column, name in enumerate(names) if name in row]
-        _plot_intervals(ax, i, agent, [x for x, _ in played], [mean for _, mean in played], linestyle="none")
-    ax.set_xticks(range(len(names)), [_in_lines(name) for name in names], fontsize="small")
-    ax.set_xlim(-0.5, len(names) - 0.5)
-    ax.set_xlabel("random delay")
-
-
-def _plot_intervals(
-    ax: Axes, i: int, agent: str, x: Sequence[float], means: Sequence[Interval], linestyle: str
-) -> None:
-    """Draw the means of the i-th agent with their intervals."""
-    value, low, high = _bounds(means)
-    ax.errorbar(
-        x, value, yerr=[value - low, high - value], color=COLORS[i % len(COLORS)], marker=MARKERS[i % len(MARKERS)],
-        markersize=5, elinewidth=1, capsize=2, linestyle=linestyle, label=agent,
-    )  # fmt: skip
-
-
 def _bounds(intervals: Sequence[Interval]) -> np.ndarray:
     """Return values, lower and upper bounds: (3, n)."""
     return np.array([(i.value, i.low, i.high) for i in intervals]).reshape(-1, 3).T
-
-
-def _figure(ax: Axes) -> Figure:
-    figure = ax.get_figure(root=True)
-    assert figure is not None  # for mypy: axes of `panels` have one
-    return figure
 
 
 def _in_lines(name: str) -> str:

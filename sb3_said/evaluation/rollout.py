@@ -5,29 +5,19 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 
 from sb3_said.evaluation.statistics import Latency
 
+if TYPE_CHECKING:
+    from stable_baselines3.common.type_aliases import PolicyPredictor
+
 Observation = Any  # one array, or a dict of arrays; batched with a leading axis where a docstring says (B, ...)
 EnvMaker = str | Callable[[], gym.Env[Any, Any]]
 State = tuple[np.ndarray, ...] | None
-
-
-class Model(Protocol):
-    """Anything with the ``predict`` of Stable-Baselines3."""
-
-    def predict(
-        self,
-        observation: Observation,
-        state: State = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, State]:
-        """Answer a batch of observations (B, ...) with actions (B, act_dim)."""
 
 
 @dataclass(frozen=True)
@@ -44,23 +34,8 @@ class Rollout:
     """(n_calls,) int64, decisions made by each call"""
 
 
-class _Slot:
-    """One environment and the episode it is playing."""
-
-    def __init__(self, env: gym.Env[Any, Any]):
-        self.env = env
-        self.observation: Observation = None
-        self.episode = -1
-        self.starting = True
-
-    def start(self, episode: int, seed: int) -> None:
-        self.observation, _ = self.env.reset(seed=seed + episode)
-        self.episode = episode
-        self.starting = True
-
-
 def rollout(
-    model: Model,
+    model: PolicyPredictor,
     env: EnvMaker,
     n_episodes: int,
     seed: int,
@@ -95,40 +70,37 @@ def rollout(
     batch_sizes: list[int] = []
     envs = [_make(env) for _ in range(min(n_envs, n_episodes))]
     try:
-        slots = [_Slot(e) for e in envs]
-        for episode, slot in enumerate(slots):
-            slot.start(episode, seed)
-        next_episode = len(slots)
+        playing = [(e, episode, e.reset(seed=seed + episode)[0]) for episode, e in enumerate(envs)]
+        next_episode = len(playing)
         state: State = None
-        while slots:
-            batch = _stack([slot.observation for slot in slots])
+        while playing:
+            batch = _stack([observation for _, _, observation in playing])
             batch = batch if normalize is None else normalize(batch)
-            episode_start = np.array([slot.starting for slot in slots])
+            episode_start = np.array([lengths[episode] == 0 for _, episode, _ in playing])
 
             began = time.perf_counter()
             actions, state = model.predict(batch, state=state, episode_start=episode_start, deterministic=deterministic)
             call_seconds.append(time.perf_counter() - began)
-            batch_sizes.append(len(slots))
+            batch_sizes.append(len(playing))
 
-            playing = []
-            for row, slot in enumerate(slots):
-                slot.observation, reward, terminated, truncated, _ = slot.env.step(actions[row])
-                slot.starting = False
-                returns[slot.episode] += float(reward)
-                lengths[slot.episode] += 1
+            going_on = {}  # by the row in this batch
+            for row, (e, episode, _) in enumerate(playing):
+                observation, reward, terminated, truncated, _ = e.step(actions[row])
+                returns[episode] += float(reward)
+                lengths[episode] += 1
                 if on_step is not None:
-                    on_step(slot.env)
+                    on_step(e)
                 if terminated or truncated:
                     if on_episode is not None:
-                        on_episode(slot.episode, float(returns[slot.episode]), int(lengths[slot.episode]))
+                        on_episode(episode, float(returns[episode]), int(lengths[episode]))
                     if next_episode == n_episodes:
                         continue
-                    slot.start(next_episode, seed)
-                    next_episode += 1
-                playing.append(row)
-            if len(playing) < len(slots):
-                state = _keep_rows(model, state, playing)
-                slots = [slots[row] for row in playing]
+                    episode, next_episode = next_episode, next_episode + 1
+                    observation, _ = e.reset(seed=seed + episode)
+                going_on[row] = (e, episode, observation)
+            if len(going_on) < len(playing):
+                state = _keep_rows(model, state, list(going_on))
+            playing = list(going_on.values())
     finally:
         for e in envs:
             e.close()
@@ -157,7 +129,7 @@ def collect_observations(env: EnvMaker, n_observations: int, seed: int) -> Obser
 
 
 def measure_latency(
-    model: Model,
+    model: PolicyPredictor,
     observations: Observation,
     n_calls: int = 200,
     deterministic: bool = True,
@@ -177,13 +149,13 @@ def measure_latency(
     """
     if n_calls < 1:
         raise ValueError(f"n_calls must be at least 1, got {n_calls}.")
-    n_observations = len(next(iter(observations.values())) if isinstance(observations, dict) else observations)
-    seconds = np.empty(n_calls + 1)
-    state: State = None
     first = -1
     if hasattr(model, "warmup"):
         model.warmup()
         first = 0
+    n_observations = len(next(iter(observations.values())) if isinstance(observations, dict) else observations)
+    seconds = []
+    state: State = None
     for call in range(first, n_calls):
         observation = _row(observations, call % n_observations)
         began = time.perf_counter()
@@ -192,8 +164,8 @@ def measure_latency(
         _, state = model.predict(
             observation, state=state, episode_start=np.array([call == first]), deterministic=deterministic
         )
-        seconds[call + 1] = time.perf_counter() - began
-    return Latency.from_seconds(seconds[1:])
+        seconds.append(time.perf_counter() - began)
+    return Latency.from_seconds(seconds[-n_calls:])
 
 
 def _make(env: EnvMaker) -> gym.Env[Any, Any]:
@@ -203,8 +175,8 @@ def _make(env: EnvMaker) -> gym.Env[Any, Any]:
 def _row(observations: Observation, row: int) -> Observation:
     """Cut one observation (1, ...) out of a batch."""
     if isinstance(observations, dict):
-        return {key: value[row : row + 1] for key, value in observations.items()}
-    return observations[row : row + 1]
+        return {key: values[[row]] for key, values in observations.items()}
+    return observations[[row]]
 
 
 def _stack(observations: list[Observation]) -> Observation:
@@ -213,7 +185,7 @@ def _stack(observations: list[Observation]) -> Observation:
     return np.stack(observations)
 
 
-def _keep_rows(model: Model, state: State, rows: list[int]) -> State:
+def _keep_rows(model: PolicyPredictor, state: State, rows: list[int]) -> State:
     """Keep the rows of the environments that go on; in sb3_contrib's recurrent states they are on axis 1."""
     if state is None:
         return None

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import DegenerateDataWarning, bootstrap
+from scipy.stats import DegenerateDataWarning, bootstrap, trim_mean
 
 
 @dataclass(frozen=True)
@@ -99,9 +99,7 @@ def iqm(values: np.ndarray, axis: int = -1) -> np.ndarray:
     :param values: at least one value along ``axis``
     :param axis: to reduce
     """
-    n = values.shape[axis]
-    middle = np.sort(values, axis=axis).take(range(n // 4, n - n // 4), axis=axis)
-    return np.asarray(middle.mean(axis=axis))
+    return np.asarray(trim_mean(values, 0.25, axis=axis))
 
 
 def bootstrap_interval(
