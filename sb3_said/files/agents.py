@@ -10,12 +10,11 @@ from collections.abc import Collection
 from typing import Any, ClassVar, TypeVar
 
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.utils import ConstantSchedule, check_for_correct_spaces, get_device, get_system_info
+from stable_baselines3.common.utils import ConstantSchedule, get_device, get_system_info
 
 from sb3_said.files.archive import PathOrFile, SavedFileError, load_metadata, load_tree, readable, save_tree
 from sb3_said.files.arguments import as_data, from_data, space_as_data, space_from_data
@@ -53,8 +52,11 @@ class SafeSaveMixin(OffPolicyAlgorithm):
                 except ValueError as error:
                     missing[name] = str(error)
         if missing:
+            supplied = ", ".join(f"{name!r}: ..." for name in missing)
             warnings.warn(
-                f"The saved file lacks arguments: {' '.join(missing.values())} {_advice(missing)}", stacklevel=2
+                f"The saved file lacks arguments: {' '.join(missing.values())} To supply them, use"
+                f" load(..., custom_objects={{{supplied}}}).",
+                stacklevel=2,
             )
         tree = {
             "arguments": arguments,
@@ -91,9 +93,8 @@ class SafeSaveMixin(OffPolicyAlgorithm):
         """
         path = _existing(path)
         if print_system_info:
-            print("== CURRENT SYSTEM INFO ==")
             get_system_info()
-            print("== SAVED MODEL SYSTEM INFO ==", load_metadata(path)["versions"], sep="\n")
+            print("Saved with", load_metadata(path)["versions"])
         names = cls._argument_names()
         given = {name: value for name, value in (custom_objects or {}).items() if name in names}
         saved = load_tree(path, cls.__name__)
@@ -103,7 +104,8 @@ class SafeSaveMixin(OffPolicyAlgorithm):
             observation_space, action_space = map(space_from_data, saved["spaces"])
             if absent := [name for name in saved["missing"] if name not in given | kwargs]:
                 warnings.warn(
-                    f"The file lacks {', '.join(absent)}: {cls.__name__} takes its defaults. {_advice(absent)}",
+                    f"The file lacks {', '.join(absent)}, so {cls.__name__} takes its defaults; custom_objects supplies"
+                    " others.",
                     stacklevel=2,
                 )
         stored = arguments.get("policy_kwargs")
@@ -113,21 +115,18 @@ class SafeSaveMixin(OffPolicyAlgorithm):
                 " networks were built with. Leave them out of the call."
             )
         policy = (arguments := arguments | kwargs).pop("policy_class", cls.policy_aliases["MlpPolicy"])
-        with readable(path, explained=(ValueError,)):
-            if env is not None:
-                env = cls._wrap_env(env, arguments.get("verbose", 0))
-                cls._check_spaces(env, observation_space, action_space)
-            arguments |= {"device": device, "_init_setup_model": False}
-            model = cls(policy, env, **arguments)  # type: ignore[arg-type]
+        with readable(path, explained=(ValueError, AssertionError)):  # SB3 asserts what it needs of an environment
+            model = cls(policy, env, device=device, _init_setup_model=False, **arguments)  # type: ignore
             _restore_counters(model, saved["counters"])  # _setup_model may ask whether the agent is new
-            if env is None:
-                model.observation_space, model.action_space = observation_space, action_space
+            model.observation_space, model.action_space = observation_space, action_space
+            if model.env is None:
                 model.n_envs = saved["n_envs"]
             model._setup_model()
             restore_agent(model, saved)
+            if model.env is not None:
+                model.set_env(model.env)
         if model.use_sde:  # its noise was drawn before the parameters were there
             model.policy.reset_noise()  # type: ignore[operator]
-        model._check_loaded()
         return model
 
     def set_parameters(
@@ -158,14 +157,6 @@ class SafeSaveMixin(OffPolicyAlgorithm):
                 parameters = inspect.signature(base).parameters.values()
                 names |= {p.name for p in parameters if p.kind is not p.VAR_KEYWORD}
         return names - _NO_ARGUMENTS
-
-    @classmethod
-    def _check_spaces(cls, env: GymEnv, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
-        """:raises ValueError: for an environment of other spaces than the agent's"""
-        check_for_correct_spaces(env, observation_space, action_space)
-
-    def _check_loaded(self) -> None:
-        """Look at an agent that was just loaded, and at its environment where it was given one."""
 
     def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:
         """Return the state dicts to take over from those given; an algorithm may leave its own in their place."""
@@ -294,7 +285,3 @@ def _existing(path: PathOrFile) -> PathOrFile:
         if not os.path.isfile(path):
             raise FileNotFoundError(f"There is no file '{path[:-4]}' and no '{path}'.")
     return path
-
-
-def _advice(names: Collection[str]) -> str:
-    return f"To supply them, use load(..., custom_objects={{{', '.join(f'{name!r}: ...' for name in names)}}})."
