@@ -21,8 +21,6 @@ from sb3_said.files.arguments import as_data, from_data, space_as_data, space_fr
 
 SelfSafeSave = TypeVar("SelfSafeSave", bound="SafeSaveMixin")
 SelfSafePolicy = TypeVar("SelfSafePolicy", bound="SafePolicyMixin")
-_COUNTERS = ("num_timesteps", "_total_timesteps", "_episode_num", "_n_updates", "_current_progress_remaining")  # SB3's
-_NO_ARGUMENTS = {"self", "policy", "env", "device", "tensorboard_log", "_init_setup_model"}  # of an agent's in a file
 
 
 class SafeSaveMixin(OffPolicyAlgorithm):
@@ -32,7 +30,9 @@ class SafeSaveMixin(OffPolicyAlgorithm):
     it counts to ``counters``, and to ``own_classes`` the classes that its constructor takes where none are given.
     """
 
-    counters: ClassVar[tuple[str, ...]] = _COUNTERS
+    counters: ClassVar[tuple[str, ...]] = (
+        "num_timesteps", "_total_timesteps", "_episode_num", "_n_updates", "_current_progress_remaining"
+    )  # fmt: skip
     own_classes: ClassVar[tuple[type, ...]] = ()
 
     def save(self, path: PathOrFile) -> None:  # type: ignore[override]
@@ -116,7 +116,8 @@ class SafeSaveMixin(OffPolicyAlgorithm):
             )
         policy = (arguments := arguments | kwargs).pop("policy_class", cls.policy_aliases["MlpPolicy"])
         with readable(path, explained=(ValueError, AssertionError)):  # SB3 asserts what it needs of an environment
-            model = cls(policy, env, device=device, _init_setup_model=False, **arguments)  # type: ignore
+            arguments |= {"device": device, "_init_setup_model": False}
+            model = cls(policy, env, **arguments)  # type: ignore[arg-type]
             _restore_counters(model, saved["counters"])  # _setup_model may ask whether the agent is new
             model.observation_space, model.action_space = observation_space, action_space
             if model.env is None:
@@ -156,7 +157,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
             if "__init__" in vars(base):
                 parameters = inspect.signature(base).parameters.values()
                 names |= {p.name for p in parameters if p.kind is not p.VAR_KEYWORD}
-        return names - _NO_ARGUMENTS
+        return names - {"self", "policy", "env", "device", "tensorboard_log", "_init_setup_model"}
 
     def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:
         """Return the state dicts to take over from those given; an algorithm may leave its own in their place."""

@@ -112,8 +112,15 @@ class DelayedReplayBuffer(ReplayBuffer):
         obs, next_obs = (x if isinstance(x, dict) else {"observation": x} for x in (obs, next_obs))
         row, previous = self.pos, (self.pos - 1) % self.buffer_size
         continues = self._continues(obs)
+        next_states = next_obs["observation"]
         if self.is_delayed:
             self._check_order(obs, next_obs, continues)
+            if missing := [i for i, info in enumerate(infos) if UNDELAYED not in info]:
+                raise ValueError(
+                    f"The info of environment {missing[0]} has no '{UNDELAYED}', without which the true state is "
+                    "unknown; wrap the task in sb3_said.DelayedObservationWrapper."
+                )
+            next_states = np.stack([info[UNDELAYED] for info in infos])
         started = np.flatnonzero(~continues)
         for env in np.flatnonzero(self.ends[row]).tolist():  # overwritten
             del self.tails[row, env]
@@ -137,7 +144,7 @@ class DelayedReplayBuffer(ReplayBuffer):
         if self.handle_timeout_termination:
             self.timeouts[row] = [info.get("TimeLimit.truncated", False) for info in infos]
 
-        self._next_states[:] = self._true_states(next_obs, infos)
+        self._next_states[:] = next_states
         self._next_ages[:] = next_obs["delay"].reshape(self.n_envs) if self.is_delayed else 0
         self._expected = {key: np.array(value) for key, value in next_obs.items()}
 
@@ -188,16 +195,6 @@ class DelayedReplayBuffer(ReplayBuffer):
                 "one before it: its action_history is not the same with one action more. Transitions must be added in "
                 "the order they happened, and each of them."
             )
-
-    def _true_states(self, next_obs: dict[str, np.ndarray], infos: list[dict[str, Any]]) -> np.ndarray:
-        if not self.is_delayed:
-            return next_obs["observation"]
-        if missing := [i for i, info in enumerate(infos) if UNDELAYED not in info]:
-            raise ValueError(
-                f"The info of environment {missing[0]} has no '{UNDELAYED}', without which the true state is unknown; "
-                "wrap the task in sb3_said.DelayedObservationWrapper."
-            )
-        return np.stack([info[UNDELAYED] for info in infos])
 
     def reset(self) -> None:
         """Forget everything stored."""

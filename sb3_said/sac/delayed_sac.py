@@ -86,15 +86,6 @@ class DelayedSAC(SafeSaveMixin, SAC):
         super().__init__(policy, env, learning_rate, learning_starts=learning_starts, **sac_kwargs)
 
     def _setup_model(self) -> None:
-        self._check_parts()
-        user_kwargs = self.policy_kwargs, self.replay_buffer_kwargs
-        self.policy_kwargs = {**self.policy_kwargs, **self._policy_flags()}
-        self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "relabelled_ages": self.relabelled_ages}
-        super()._setup_model()
-        self.policy_kwargs, self.replay_buffer_kwargs = user_kwargs
-
-    def _check_parts(self) -> None:
-        """:raises ValueError: for a policy, a replay buffer or a normalisation that does not go with delays"""
         name, policy_class = type(self).__name__, self.policy_aliases["MlpPolicy"]
         if not issubclass(self.policy_class, policy_class):
             raise ValueError(
@@ -117,6 +108,11 @@ class DelayedSAC(SafeSaveMixin, SAC):
                 f"VecNormalize must leave actions and ages as they are, but normalises {', '.join(sorted(keys))}; "
                 "use VecNormalize(..., norm_obs_keys=['observation'])."
             )
+        user_kwargs = self.policy_kwargs, self.replay_buffer_kwargs
+        self.policy_kwargs = {**self.policy_kwargs, **self._policy_flags()}
+        self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "relabelled_ages": self.relabelled_ages}
+        super()._setup_model()
+        self.policy_kwargs, self.replay_buffer_kwargs = user_kwargs
 
     def _policy_flags(self) -> dict[str, Any]:
         """Return what the policy's constructor needs of this algorithm's own arguments."""
@@ -135,14 +131,13 @@ class DelayedSAC(SafeSaveMixin, SAC):
 
         The next ``learn`` starts new episodes then, instead of going on from an observation that is gone.
         """
-        is_whole = False
+        rollout = None
         try:
             rollout = super().collect_rollouts(*args, **kwargs)
-            is_whole = rollout.continue_training
+            return rollout
         finally:
-            if not is_whole:
+            if rollout is None or not rollout.continue_training:
                 self._last_obs = None
-        return rollout
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Take another environment, as SB3 does; see :meth:`check_ages` for one with another delay."""

@@ -42,15 +42,11 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         self.delay_reconciled_critic = delay_reconciled_critic
         self.replay_space: spaces.Dict | None = None
         if isinstance(observation_space, spaces.Dict):
-            if policy_kwargs.get("features_extractor_class", FlattenExtractor) is not FlattenExtractor:
+            is_shared = policy_kwargs.get("share_features_extractor", False)
+            if is_shared or policy_kwargs.get("features_extractor_class", FlattenExtractor) is not FlattenExtractor:
                 raise ValueError(
-                    "What actor and critics read of a delayed observation is set by augment_state and "
-                    "delay_reconciled_critic; leave features_extractor_class out."
-                )
-            if policy_kwargs.get("share_features_extractor", False):
-                raise ValueError(
-                    "Actor and critics read different things of a delayed observation; leave "
-                    "share_features_extractor=False."
+                    "augment_state and delay_reconciled_critic set what actor and critics each read of a delayed "
+                    "observation; leave features_extractor_class and share_features_extractor out."
                 )
             self.replay_space = spaces.Dict({**observation_space.spaces, UNDELAYED: state_space})
         super().__init__(observation_space, action_space, lr_schedule, **policy_kwargs)

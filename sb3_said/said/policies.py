@@ -14,7 +14,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
-from sb3_said.delays.space import UNDELAYED, check_spaces, has_state_history
+from sb3_said.delays.space import KEYS, STATE_KEYS, UNDELAYED, check_spaces, has_state_history
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner.graphs import EAGER_CALLS
 from sb3_said.sac.policies import DelayedSACPolicy
@@ -123,10 +123,10 @@ class SAIDPolicy(DelayedSACPolicy):
 
         :param repeats: let the observation, of one row, decide the noise
         """
-        state_history = state_known = None
+        extra: dict[str, Any] = {}
         if isinstance(observation, dict):
-            state_history, state_known = observation.get("state_history"), observation.get("state_known")
-            states, history, delay = (observation[key] for key in ("observation", "action_history", "delay"))
+            extra = {key: observation[key] for key in STATE_KEYS if key in observation}
+            states, history, delay = (observation[key] for key in KEYS)
             delay = delay[:, 0].long()
         else:
             states, history = observation, observation.new_zeros(len(observation), 0, self.planner.act_dim)
@@ -138,8 +138,7 @@ class SAIDPolicy(DelayedSACPolicy):
             delay,
             value_fn=self.value if chooses else None,
             noise=self._noise_of(observation) if chooses and repeats else None,
-            state_history=state_history,
-            state_known=state_known,
+            **extra,
         )
         return plan.action
 

@@ -90,25 +90,22 @@ class SAID(DelayedSAC):
         policy = getattr(self, "policy", None)
         return self._given_planner_kwargs if policy is None else policy.planner.config.to_dict()
 
-    def _check_parts(self) -> None:
-        super()._check_parts()
+    def _setup_model(self) -> None:
         vec_normalize = self.get_vec_normalize_env()
         if has_state_history(self.observation_space) and vec_normalize is not None and vec_normalize.norm_obs:
             raise ValueError(
                 "VecNormalize scales the observation and not the state_history, which must have the same units; use "
                 "VecNormalize(..., norm_obs=False), or leave state_history=False in DelayedObservationWrapper."
             )
-
-    def _policy_flags(self) -> dict[str, Any]:
-        return {**super()._policy_flags(), "planner_kwargs": self.planner_kwargs}
-
-    def _setup_model(self) -> None:
         super()._setup_model()
         if self.trained_ages is None and self.env is not None:  # else it was loaded, and check_ages says it
             try:
                 self.policy.planner.check_ages(ages_of(self.env))
             except ValueError as error:  # no error yet: the expert may learn under another delay
                 warnings.warn(str(error), stacklevel=3)
+
+    def _policy_flags(self) -> dict[str, Any]:
+        return {**super()._policy_flags(), "planner_kwargs": self.planner_kwargs}
 
     def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:
         """Keep this agent's own planner where the given one was never trained and has other settings."""
