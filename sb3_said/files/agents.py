@@ -86,7 +86,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
 
         :param path: path, with or without its ``.zip``, or a seekable binary file object
         :param custom_objects: constructor arguments to take instead of those in the file; other names are ignored
-        :param force_reset: of SB3, without effect: a file holds no episode to go on with, so learning starts a new one
+        :param force_reset: has no effect, as learning always starts a new episode after loading
         :param kwargs: constructor arguments to take instead of those in the file
         :raises SavedFileError: if the file is damaged, foreign, forged, newer than this package or of another class,
             or does not go with the environment or the arguments
@@ -138,7 +138,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
     ) -> None:
         """Take over networks and optimizers from state dicts, as SB3 does, or from a file of :meth:`save`.
 
-        :param exact_match: refuse what lacks a part; False takes what there is
+        :param exact_match: refuse parameters that lack a part; False takes those that are given
         :raises SavedFileError: if the file cannot be read or does not fit
         """
         if isinstance(load_path_or_dict, dict):
@@ -160,7 +160,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
         return names - {"self", "policy", "env", "device", "tensorboard_log", "_init_setup_model"}
 
     def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:
-        """Return the state dicts to take over from those given; an algorithm may leave its own in their place."""
+        """Return the state dicts to take over from those given; an algorithm may keep some of its own."""
         return params
 
 

@@ -35,7 +35,7 @@ class DelayedReplayBuffer(ReplayBuffer):
     :param action_space: bounded 1-D Box
     :param device: of sampled tensors
     :param n_envs: parallel environments
-    :param optimize_memory_usage: accepted for SB3's sake; must be False, as memory is optimized anyway
+    :param optimize_memory_usage: must be False; each state is stored once anyway
     :param handle_timeout_termination: bootstrap at time limits
     :param relabelled_ages: part of the sampled transitions that are shown as they would have been observed at another
         one's age, in [0, 1]. The true states are all known, so that an episode under one delay teaches the others too;

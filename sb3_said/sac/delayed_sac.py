@@ -48,8 +48,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
         delays vary, each step teaches the actor what to do under the others too. Measured at delays 0..16
         (results/README.md); 0 is SADR as published. Under one fixed delay nothing changes
     :param sac_kwargs: every other argument of :class:`stable_baselines3.SAC`
-    :raises ValueError: for spaces that are neither, a ``VecNormalize`` of more than the observation, or options that
-        need another replay buffer (``n_steps`` > 1) or policy
+    :raises ValueError: for other spaces, a ``VecNormalize`` of more than the observation, or options that need another
+        replay buffer (``n_steps`` > 1) or policy
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -77,7 +77,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
             raise ValueError(
                 f"DelayedSAC learns from one-step targets, got n_steps={sac_kwargs['n_steps']}; leave it 1."
             )
-        self.trained_ages: list[int] | None = None  # of the observations it has learned from last, amid episodes
+        self.trained_ages: list[int] | None = None  # amid episodes, in the latest call of learn()
         self.augment_state = augment_state
         self.delay_reconciled_critic = delay_reconciled_critic
         self.relabelled_ages = relabelled_ages

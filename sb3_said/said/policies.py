@@ -169,7 +169,7 @@ class SAIDPolicy(DelayedSACPolicy):
         arrays = {key: np.zeros((batch_size, *(part.shape or ())), np.float32) for key, part in parts.items()}
         on_gpu = self.device.type == "cuda"
         calls = range(EAGER_CALLS + 1 if on_gpu else 1)
-        with th.random.fork_rng(devices=[self.device] if on_gpu else []):  # who draws afterwards draws the same
+        with th.random.fork_rng(devices=[self.device] if on_gpu else []):  # later draws stay the same
             for delay, deterministic, _ in product((0, self.max_delay), (True, False), calls):
                 if "delay" in arrays:
                     arrays["delay"][:] = delay
