@@ -10,20 +10,17 @@ from collections.abc import Collection
 from typing import Any, ClassVar, TypeVar
 
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.utils import ConstantSchedule, check_for_correct_spaces, get_device, get_system_info
+from stable_baselines3.common.utils import ConstantSchedule, get_device, get_system_info
 
 from sb3_said.files.archive import PathOrFile, SavedFileError, load_metadata, load_tree, readable, save_tree
 from sb3_said.files.arguments import as_data, from_data, space_as_data, space_from_data
 
 SelfSafeSave = TypeVar("SelfSafeSave", bound="SafeSaveMixin")
 SelfSafePolicy = TypeVar("SelfSafePolicy", bound="SafePolicyMixin")
-_COUNTERS = ("num_timesteps", "_total_timesteps", "_episode_num", "_n_updates", "_current_progress_remaining")  # SB3's
-_NO_ARGUMENTS = {"self", "policy", "env", "device", "tensorboard_log", "_init_setup_model"}  # of an agent's in a file
 
 
 class SafeSaveMixin(OffPolicyAlgorithm):
@@ -33,7 +30,9 @@ class SafeSaveMixin(OffPolicyAlgorithm):
     it counts to ``counters``, and to ``own_classes`` the classes that its constructor takes where none are given.
     """
 
-    counters: ClassVar[tuple[str, ...]] = _COUNTERS
+    counters: ClassVar[tuple[str, ...]] = (
+        "num_timesteps", "_total_timesteps", "_episode_num", "_n_updates", "_current_progress_remaining"
+    )  # fmt: skip
     own_classes: ClassVar[tuple[type, ...]] = ()
 
     def save(self, path: PathOrFile) -> None:  # type: ignore[override]
@@ -53,8 +52,11 @@ class SafeSaveMixin(OffPolicyAlgorithm):
                 except ValueError as error:
                     missing[name] = str(error)
         if missing:
+            supplied = ", ".join(f"{name!r}: ..." for name in missing)
             warnings.warn(
-                f"The saved file lacks arguments: {' '.join(missing.values())} {_advice(missing)}", stacklevel=2
+                f"The saved file lacks arguments: {' '.join(missing.values())} To supply them, use"
+                f" load(..., custom_objects={{{supplied}}}).",
+                stacklevel=2,
             )
         tree = {
             "arguments": arguments,
@@ -84,16 +86,15 @@ class SafeSaveMixin(OffPolicyAlgorithm):
 
         :param path: path, with or without its ``.zip``, or a seekable binary file object
         :param custom_objects: constructor arguments to take instead of those in the file; other names are ignored
-        :param force_reset: of SB3, without effect: a file holds no episode to go on with, so learning starts a new one
+        :param force_reset: has no effect, as learning always starts a new episode after loading
         :param kwargs: constructor arguments to take instead of those in the file
         :raises SavedFileError: if the file is damaged, foreign, forged, newer than this package or of another class,
             or does not go with the environment or the arguments
         """
         path = _existing(path)
         if print_system_info:
-            print("== CURRENT SYSTEM INFO ==")
             get_system_info()
-            print("== SAVED MODEL SYSTEM INFO ==", load_metadata(path)["versions"], sep="\n")
+            print("Saved with", load_metadata(path)["versions"])
         names = cls._argument_names()
         given = {name: value for name, value in (custom_objects or {}).items() if name in names}
         saved = load_tree(path, cls.__name__)
@@ -103,7 +104,8 @@ class SafeSaveMixin(OffPolicyAlgorithm):
             observation_space, action_space = map(space_from_data, saved["spaces"])
             if absent := [name for name in saved["missing"] if name not in given | kwargs]:
                 warnings.warn(
-                    f"The file lacks {', '.join(absent)}: {cls.__name__} takes its defaults. {_advice(absent)}",
+                    f"The file lacks {', '.join(absent)}, so {cls.__name__} takes its defaults; custom_objects supplies"
+                    " others.",
                     stacklevel=2,
                 )
         stored = arguments.get("policy_kwargs")
@@ -113,21 +115,19 @@ class SafeSaveMixin(OffPolicyAlgorithm):
                 " networks were built with. Leave them out of the call."
             )
         policy = (arguments := arguments | kwargs).pop("policy_class", cls.policy_aliases["MlpPolicy"])
-        with readable(path, explained=(ValueError,)):
-            if env is not None:
-                env = cls._wrap_env(env, arguments.get("verbose", 0))
-                cls._check_spaces(env, observation_space, action_space)
+        with readable(path, explained=(ValueError, AssertionError)):  # SB3 asserts what it needs of an environment
             arguments |= {"device": device, "_init_setup_model": False}
             model = cls(policy, env, **arguments)  # type: ignore[arg-type]
             _restore_counters(model, saved["counters"])  # _setup_model may ask whether the agent is new
-            if env is None:
-                model.observation_space, model.action_space = observation_space, action_space
+            model.observation_space, model.action_space = observation_space, action_space
+            if model.env is None:
                 model.n_envs = saved["n_envs"]
             model._setup_model()
             restore_agent(model, saved)
+            if model.env is not None:
+                model.set_env(model.env)
         if model.use_sde:  # its noise was drawn before the parameters were there
             model.policy.reset_noise()  # type: ignore[operator]
-        model._check_loaded()
         return model
 
     def set_parameters(
@@ -138,7 +138,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
     ) -> None:
         """Take over networks and optimizers from state dicts, as SB3 does, or from a file of :meth:`save`.
 
-        :param exact_match: refuse what lacks a part; False takes what there is
+        :param exact_match: refuse parameters that lack a part; False takes those that are given
         :raises SavedFileError: if the file cannot be read or does not fit
         """
         if isinstance(load_path_or_dict, dict):
@@ -157,18 +157,10 @@ class SafeSaveMixin(OffPolicyAlgorithm):
             if "__init__" in vars(base):
                 parameters = inspect.signature(base).parameters.values()
                 names |= {p.name for p in parameters if p.kind is not p.VAR_KEYWORD}
-        return names - _NO_ARGUMENTS
-
-    @classmethod
-    def _check_spaces(cls, env: GymEnv, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
-        """:raises ValueError: for an environment of other spaces than the agent's"""
-        check_for_correct_spaces(env, observation_space, action_space)
-
-    def _check_loaded(self) -> None:
-        """Look at an agent that was just loaded, and at its environment where it was given one."""
+        return names - {"self", "policy", "env", "device", "tensorboard_log", "_init_setup_model"}
 
     def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:
-        """Return the state dicts to take over from those given; an algorithm may leave its own in their place."""
+        """Return the state dicts to take over from those given; an algorithm may keep some of its own."""
         return params
 
 
@@ -294,7 +286,3 @@ def _existing(path: PathOrFile) -> PathOrFile:
         if not os.path.isfile(path):
             raise FileNotFoundError(f"There is no file '{path[:-4]}' and no '{path}'.")
     return path
-
-
-def _advice(names: Collection[str]) -> str:
-    return f"To supply them, use load(..., custom_objects={{{', '.join(f'{name!r}: ...' for name in names)}}})."

@@ -91,7 +91,7 @@ def load_metadata(path: PathOrFile) -> dict[str, Any]:
 def readable(source: PathOrFile, explained: tuple[type[Exception], ...] = (SavedFileError,)) -> Iterator[None]:
     """Turn whatever goes wrong while reading a damaged or forged file into one error that names the file.
 
-    :param explained: errors whose text says already what is wrong
+    :param explained: errors that already say what is wrong
     """
     name = f"'{os.fspath(source)}'" if isinstance(source, (str, os.PathLike)) else "the file object"
     try:

@@ -13,7 +13,7 @@ from typing import IO, Any
 
 PathOrFile = str | os.PathLike[str] | IO[bytes]
 
-ABANDONED_AFTER = 600.0  # seconds since a write's last byte: a living one is never that slow
+ABANDONED_AFTER = 600.0  # seconds since a write's last byte; no running write is that slow
 
 
 @contextlib.contextmanager
@@ -43,7 +43,7 @@ def replacing(target: PathOrFile) -> Iterator[IO[bytes]]:
         with open(scratch, "xb") as file:
             now = scratch.stat().st_mtime  # by the file system's clock, as the others' times
             for left in path.parent.glob(glob.escape(f".{path.name}.") + "[0-9a-f]" * 8 + ".tmp"):
-                with contextlib.suppress(OSError):  # where it cannot be removed, it is only in the way
+                with contextlib.suppress(OSError):  # one that cannot be removed does no harm
                     if now - left.stat().st_mtime > ABANDONED_AFTER:
                         left.unlink()
             yield file
@@ -64,7 +64,7 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, document: Any, default: Callable[[Any], Any] | None = None) -> None:
     """Write a JSON document, indented for its readers, as :func:`replacing` writes.
 
-    :param default: makes of what JSON does not know something that it knows
+    :param default: turns an object that JSON lacks into one that it has
     :raises ValueError: if it holds NaN or an infinite number, which JSON lacks
     """
     write_text(path, json.dumps(document, indent=2, allow_nan=False, default=default) + "\n")

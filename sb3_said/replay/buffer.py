@@ -35,7 +35,7 @@ class DelayedReplayBuffer(ReplayBuffer):
     :param action_space: bounded 1-D Box
     :param device: of sampled tensors
     :param n_envs: parallel environments
-    :param optimize_memory_usage: accepted for SB3's sake; must be False, as memory is optimized anyway
+    :param optimize_memory_usage: must be False; each state is stored once anyway
     :param handle_timeout_termination: bootstrap at time limits
     :param relabelled_ages: part of the sampled transitions that are shown as they would have been observed at another
         one's age, in [0, 1]. The true states are all known, so that an episode under one delay teaches the others too;
@@ -112,8 +112,15 @@ class DelayedReplayBuffer(ReplayBuffer):
         obs, next_obs = (x if isinstance(x, dict) else {"observation": x} for x in (obs, next_obs))
         row, previous = self.pos, (self.pos - 1) % self.buffer_size
         continues = self._continues(obs)
+        next_states = next_obs["observation"]
         if self.is_delayed:
             self._check_order(obs, next_obs, continues)
+            if missing := [i for i, info in enumerate(infos) if UNDELAYED not in info]:
+                raise ValueError(
+                    f"The info of environment {missing[0]} has no '{UNDELAYED}', without which the true state is "
+                    "unknown; wrap the task in sb3_said.DelayedObservationWrapper."
+                )
+            next_states = np.stack([info[UNDELAYED] for info in infos])
         started = np.flatnonzero(~continues)
         for env in np.flatnonzero(self.ends[row]).tolist():  # overwritten
             del self.tails[row, env]
@@ -137,7 +144,7 @@ class DelayedReplayBuffer(ReplayBuffer):
         if self.handle_timeout_termination:
             self.timeouts[row] = [info.get("TimeLimit.truncated", False) for info in infos]
 
-        self._next_states[:] = self._true_states(next_obs, infos)
+        self._next_states[:] = next_states
         self._next_ages[:] = next_obs["delay"].reshape(self.n_envs) if self.is_delayed else 0
         self._expected = {key: np.array(value) for key, value in next_obs.items()}
 
@@ -173,7 +180,7 @@ class DelayedReplayBuffer(ReplayBuffer):
     def _check_order(self, obs: dict[str, np.ndarray], next_obs: dict[str, np.ndarray], continues: np.ndarray) -> None:
         """:raises ValueError: for a transition that, as histories and ages tell, is out of order"""
         history = obs["action_history"]
-        if not continues.all() and (joined := np.flatnonzero(~continues & ~self._starts(obs))).size:
+        if (joined := np.flatnonzero(~continues & ~self._starts(obs))).size:
             env = joined[0]
             raise ValueError(
                 f"The first observation of an episode must have age 0 and an empty past, but that of environment {env} "
@@ -188,17 +195,6 @@ class DelayedReplayBuffer(ReplayBuffer):
                 "one before it: its action_history is not the same with one action more. Transitions must be added in "
                 "the order they happened, and each of them."
             )
-
-    def _true_states(self, next_obs: dict[str, np.ndarray], infos: list[dict[str, Any]]) -> np.ndarray:
-        if not self.is_delayed:
-            return next_obs["observation"]
-        missing = [i for i, info in enumerate(infos) if UNDELAYED not in info]
-        if missing:
-            raise ValueError(
-                f"The info of environment {missing[0]} has no '{UNDELAYED}', without which the true state is unknown; "
-                "wrap the task in sb3_said.DelayedObservationWrapper."
-            )
-        return np.stack([info[UNDELAYED] for info in infos])
 
     def reset(self) -> None:
         """Forget everything stored."""
@@ -333,8 +329,7 @@ class DelayedReplayBuffer(ReplayBuffer):
 
         states = self.observations
         if env is not None and self.is_delayed:
-            raw = {key: np.zeros((1, *space.shape), np.float32) for key, space in self.observation_space.items()}  # type: ignore[attr-defined]
-            states = env.normalize_obs({**raw, "observation": states})["observation"]
+            states = env.normalize_obs({"observation": states})["observation"]
         elif env is not None:
             states = env.normalize_obs(states)  # type: ignore[assignment]  # an array for an array
         grid = np.broadcast_to(rows[:, None], ends.shape), np.broadcast_to(np.arange(self.n_envs), ends.shape)
@@ -382,16 +377,19 @@ class DelayedReplayBuffer(ReplayBuffer):
 
         :raises ValueError: when it came from a buffer of another shape
         """
-        size = len(state["rewards"])
+        size, space, expected = len(state["rewards"]), self.observation_space, state["expected"]
         fits = size == self.buffer_size if state["full"] else size == state["pos"] <= self.buffer_size
         fits = fits and all(state[name].shape[1:] == getattr(self, name).shape[1:] for name in _ROW_ARRAYS)
-        if not fits or not self._fits(state["expected"]):
+        if expected is not None:  # the observation that would continue the replay is of this buffer's task
+            boxes = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
+            sizes = {key: self.n_envs * int(np.prod(box.shape)) for key, box in boxes.items()}  # type: ignore[arg-type]
+            fits = fits and sizes == {key: x.size for key, x in expected.items()}
+        if not fits:
             raise ValueError(
                 f"A stored replay of shape {state['observations'].shape} does not fit a buffer of shape "
                 f"{self.observations.shape}; use the buffer_size, n_envs, task and max_delay it was made with."
             )
-        self.pos, self.full = state["pos"], state["full"]
-        self._expected = state["expected"]
+        self.pos, self.full, self._expected = state["pos"], state["full"], expected
         self._next_states, self._next_ages = state["next_states"].copy(), state["next_ages"].copy()
         places = map(tuple, state["tail_places"].tolist())
         self.tails = dict(
@@ -400,10 +398,3 @@ class DelayedReplayBuffer(ReplayBuffer):
         for name in _ROW_ARRAYS:
             getattr(self, name)[:size] = state[name]
         self.ends[size:] = False  # of whatever was stored before
-
-    def _fits(self, expected: dict[str, np.ndarray] | None) -> bool:
-        """Tell whether the observation that would continue a stored replay is of this buffer's task."""
-        space = self.observation_space
-        boxes = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
-        sizes = {key: self.n_envs * int(np.prod(box.shape)) for key, box in boxes.items()}  # type: ignore[arg-type]
-        return expected is None or {key: x.size for key, x in expected.items()} == sizes

@@ -8,15 +8,10 @@ import warnings
 from typing import Any, ClassVar
 
 import numpy as np
-from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import (
-    GymEnv,
-    RolloutReturn,
-    Schedule,
-)
+from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn, Schedule
 
 from sb3_said.delays.space import ages_of, check_spaces, written_ages
 from sb3_said.files.agents import SafeSaveMixin
@@ -53,8 +48,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
         delays vary, each step teaches the actor what to do under the others too. Measured at delays 0..16
         (results/README.md); 0 is SADR as published. Under one fixed delay nothing changes
     :param sac_kwargs: every other argument of :class:`stable_baselines3.SAC`
-    :raises ValueError: for spaces that are neither, a ``VecNormalize`` of more than the observation, or options that
-        need another replay buffer (``n_steps`` > 1) or policy
+    :raises ValueError: for other spaces, a ``VecNormalize`` of more than the observation, or options that need another
+        replay buffer (``n_steps`` > 1) or policy
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -82,24 +77,15 @@ class DelayedSAC(SafeSaveMixin, SAC):
             raise ValueError(
                 f"DelayedSAC learns from one-step targets, got n_steps={sac_kwargs['n_steps']}; leave it 1."
             )
-        self.trained_ages: list[int] | None = None  # of the observations it has learned from last, amid episodes
+        self.trained_ages: list[int] | None = None  # amid episodes, in the latest call of learn()
         self.augment_state = augment_state
         self.delay_reconciled_critic = delay_reconciled_critic
         self.relabelled_ages = relabelled_ages
-        if isinstance(policy, str):  # SB3 would refuse one of the two names, by the kind of space
+        if isinstance(policy, str):  # SB3 takes one name for Box spaces and the other for Dict
             policy = self.policy_aliases.get(policy, policy)  # type: ignore[assignment]
         super().__init__(policy, env, learning_rate, learning_starts=learning_starts, **sac_kwargs)
 
     def _setup_model(self) -> None:
-        self._check_parts()
-        user_kwargs = self.policy_kwargs, self.replay_buffer_kwargs
-        self.policy_kwargs = {**self.policy_kwargs, **self._policy_flags()}
-        self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "relabelled_ages": self.relabelled_ages}
-        super()._setup_model()
-        self.policy_kwargs, self.replay_buffer_kwargs = user_kwargs
-
-    def _check_parts(self) -> None:
-        """:raises ValueError: for a policy, a replay buffer or a normalisation that does not go with delays"""
         name, policy_class = type(self).__name__, self.policy_aliases["MlpPolicy"]
         if not issubclass(self.policy_class, policy_class):
             raise ValueError(
@@ -112,18 +98,21 @@ class DelayedSAC(SafeSaveMixin, SAC):
                 f"{name} learns from a DelayedReplayBuffer, got {self.replay_buffer_class.__name__}; "
                 "leave replay_buffer_class out."
             )
-        if twice := sorted(self._policy_flags().keys() & self.policy_kwargs.keys()):
-            raise ValueError(f"Give {', '.join(twice)} to {name} itself, not in policy_kwargs.")
-        if "relabelled_ages" in self.replay_buffer_kwargs:
-            raise ValueError(f"Give relabelled_ages to {name} itself, not in replay_buffer_kwargs.")
+        own, given = {*self._policy_flags(), "relabelled_ages"}, {*self.policy_kwargs, *self.replay_buffer_kwargs}
+        if twice := sorted(own & given):
+            raise ValueError(f"Give {', '.join(twice)} to {name} itself, not in policy_kwargs or replay_buffer_kwargs.")
         vec_normalize = self.get_vec_normalize_env()
-        if isinstance(self.observation_space, spaces.Dict) and vec_normalize is not None and vec_normalize.norm_obs:
-            keys = vec_normalize.norm_obs_keys or []
-            if not set(keys) <= {"observation"}:
-                raise ValueError(
-                    f"VecNormalize must leave actions and ages as they are, but normalises {', '.join(sorted(keys))}; "
-                    "use VecNormalize(..., norm_obs_keys=['observation'])."
-                )
+        keys = [] if vec_normalize is None or not vec_normalize.norm_obs else vec_normalize.norm_obs_keys or []
+        if not set(keys) <= {"observation"}:
+            raise ValueError(
+                f"VecNormalize must leave actions and ages as they are, but normalises {', '.join(sorted(keys))}; "
+                "use VecNormalize(..., norm_obs_keys=['observation'])."
+            )
+        user_kwargs = self.policy_kwargs, self.replay_buffer_kwargs
+        self.policy_kwargs = {**self.policy_kwargs, **self._policy_flags()}
+        self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "relabelled_ages": self.relabelled_ages}
+        super()._setup_model()
+        self.policy_kwargs, self.replay_buffer_kwargs = user_kwargs
 
     def _policy_flags(self) -> dict[str, Any]:
         """Return what the policy's constructor needs of this algorithm's own arguments."""
@@ -142,34 +131,24 @@ class DelayedSAC(SafeSaveMixin, SAC):
 
         The next ``learn`` starts new episodes then, instead of going on from an observation that is gone.
         """
-        is_whole = False
+        rollout = None
         try:
             rollout = super().collect_rollouts(*args, **kwargs)
-            is_whole = rollout.continue_training
+            return rollout
         finally:
-            if not is_whole:
+            if rollout is None or not rollout.continue_training:
                 self._last_obs = None
-        return rollout
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Take another environment, as SB3 does; see :meth:`check_ages` for one with another delay."""
-        self._check_spaces(env, self.observation_space, self.action_space)
-        self.check_ages(ages_of(env))
-        super().set_env(env, force_reset)
-
-    @classmethod
-    def _check_spaces(cls, env: GymEnv, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
-        own, given = (check_spaces(space, action_space)[1] for space in (observation_space, env.observation_space))
+        own, given = self.policy.max_delay, check_spaces(env.observation_space, self.action_space)[1]
         if own != given:
             raise ValueError(
-                f"This {cls.__name__} was built for max_delay={own}, but this environment has max_delay={given}; "
-                f"where its delays allow, give it DelayedObservationWrapper(..., max_delay={own})."
+                f"This {type(self).__name__} was built for max_delay={own}, but this environment has max_delay={given};"
+                f" where its delays allow, give it DelayedObservationWrapper(..., max_delay={own})."
             )
-        super()._check_spaces(env, observation_space, action_space)
-
-    def _check_loaded(self) -> None:
-        if self.env is not None:
-            self.check_ages(ages_of(self.env))
+        self.check_ages(ages_of(env))
+        super().set_env(env, force_reset)
 
     def check_ages(self, ages: list[int]) -> None:
         """Warn where an agent is to act on observations of ages that it has not met in training, amid episodes.
@@ -178,17 +157,13 @@ class DelayedSAC(SafeSaveMixin, SAC):
 
         :param ages: that it will meet, in control steps (see :func:`ages_of`)
         """
-        if self.trained_ages is None:
-            return
-        unmet = sorted(set(ages) - set(self.trained_ages))
-        if not unmet or self._serves(ages):
-            return
-        warnings.warn(
-            f"This {type(self).__name__} learned at ages {written_ages(self.trained_ages)} and is given "
-            f"{written_ages(unmet)}: what it does at ages it has not met is undefined. Train it on a range, such as "
-            "delay=(0, 8), or give it the delay it knows.",
-            stacklevel=3,
-        )
+        if self.trained_ages is not None and (unmet := sorted(set(ages) - set(self.trained_ages))):
+            warnings.warn(
+                f"This {type(self).__name__} learned at ages {written_ages(self.trained_ages)} and is given "
+                f"{written_ages(unmet)}: what it does at ages it has not met is undefined. Train it on a range, such "
+                "as delay=(0, 8), or give it the delay it knows.",
+                stacklevel=3,
+            )
 
     def predict(
         self,
@@ -204,12 +179,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
             if not set(ages.tolist()) <= set(self.trained_ages):
                 # As many actions as the history holds have been sent: no younger age is due to the episode's start.
                 history = np.reshape(observation["action_history"], (len(ages), self.policy.max_delay, -1))
-                DelayedSAC.check_ages(self, sorted({int(age) for age in ages[history[:, 0].any(1)]}))
+                self.check_ages(sorted({int(age) for age in ages[history[:, 0].any(1)]}))
         return answer
-
-    def _serves(self, ages: list[int]) -> bool:
-        """Tell whether answers are as good at ages that training did not bring."""
-        return False
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """Write the replay buffer to a file without pickle.

@@ -42,40 +42,29 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         self.delay_reconciled_critic = delay_reconciled_critic
         self.replay_space: spaces.Dict | None = None
         if isinstance(observation_space, spaces.Dict):
-            if policy_kwargs.get("features_extractor_class", FlattenExtractor) is not FlattenExtractor:
+            is_shared = policy_kwargs.get("share_features_extractor", False)
+            if is_shared or policy_kwargs.get("features_extractor_class", FlattenExtractor) is not FlattenExtractor:
                 raise ValueError(
-                    "What actor and critics read of a delayed observation is set by augment_state and "
-                    "delay_reconciled_critic; leave features_extractor_class out."
-                )
-            if policy_kwargs.get("share_features_extractor", False):
-                raise ValueError(
-                    "Actor and critics read different things of a delayed observation; leave "
-                    "share_features_extractor=False."
+                    "augment_state and delay_reconciled_critic set what actor and critics each read of a delayed "
+                    "observation; leave features_extractor_class and share_features_extractor out."
                 )
             self.replay_space = spaces.Dict({**observation_space.spaces, UNDELAYED: state_space})
         super().__init__(observation_space, action_space, lr_schedule, **policy_kwargs)
 
-    def _actor_extractor(self) -> BaseFeaturesExtractor | None:
-        if self.replay_space is None:
-            return None
-        if self.augment_state:
-            return StateAugmentedExtractor(self.replay_space)
-        return KeyExtractor(self.replay_space, "observation")
-
-    def _critic_extractor(self) -> BaseFeaturesExtractor | None:
-        if self.replay_space is not None and self.delay_reconciled_critic:
-            return KeyExtractor(self.replay_space, UNDELAYED)
-        return self._actor_extractor()
-
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
-        if self.replay_space is not None:
-            self.actor_kwargs["observation_space"] = self.replay_space
-        return super().make_actor(features_extractor or self._actor_extractor())
+        return super().make_actor(features_extractor or self._extractor(self.actor_kwargs, "observation"))
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
-        if self.replay_space is not None:
-            self.critic_kwargs["observation_space"] = self.replay_space
-        return super().make_critic(features_extractor or self._critic_extractor())
+        key = UNDELAYED if self.delay_reconciled_critic else "observation"
+        return super().make_critic(features_extractor or self._extractor(self.critic_kwargs, key))
+
+    def _extractor(self, network_kwargs: dict[str, Any], key: str) -> BaseFeaturesExtractor | None:
+        if self.replay_space is None:
+            return None
+        network_kwargs["observation_space"] = self.replay_space
+        if self.augment_state and key != UNDELAYED:
+            return StateAugmentedExtractor(self.replay_space)
+        return KeyExtractor(self.replay_space, key)
 
     def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
         """Turn what ``predict`` was given into float32 tensors of their own memory, after checking it.
@@ -86,33 +75,30 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
             other keys, an age outside 0..max_delay, or a ``state_known`` other than 0 and 1
         """
         space = self.observation_space
-        if not isinstance(space, spaces.Dict):
-            if isinstance(observation, dict):
-                raise ValueError(
-                    f"The agent was built for a task without delay, got a dict with the keys {list(observation)}; "
-                    "leave DelayedObservationWrapper out."
-                )
-            values = _as_float32("observation", observation)
-            is_batch = _check_array("observation", values, space) is not None
-            return th.as_tensor(values if is_batch else values[None], device=self.device), is_batch
-        if not isinstance(observation, dict) or set(observation) != set(space.keys()):
-            given = f"the keys {list(observation)}" if isinstance(observation, dict) else type(observation).__name__
+        is_delayed = isinstance(space, spaces.Dict)
+        boxes = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
+        if isinstance(observation, dict) and not is_delayed:
             raise ValueError(
-                f"The agent was built for dict observations with the keys {sorted(space.keys())}, got {given}; "
+                f"The agent was built for a task without delay, got a dict with the keys {list(observation)}; "
+                "leave DelayedObservationWrapper out."
+            )
+        parts = observation if isinstance(observation, dict) else {"observation": observation}
+        if is_delayed and (parts is not observation or set(parts) != set(boxes)):
+            given = f"the keys {list(parts)}" if parts is observation else type(observation).__name__
+            raise ValueError(
+                f"The agent was built for dict observations with the keys {sorted(boxes)}, got {given}; "
                 "wrap the task in DelayedObservationWrapper."
             )
-        arrays = {key: _as_float32(key, observation[key]) for key in space.keys()}
-        batches = {key: _check_array(key, values, space[key]) for key, values in arrays.items()}
+        arrays = {key: _as_float32(key, parts[key], box) for key, box in boxes.items()}
+        batches = {key: None if x.shape == boxes[key].shape else len(x) for key, x in arrays.items()}
         if len(set(batches.values())) > 1:
             raise ValueError(f"The parts of an observation differ in how many there are: {batches}.")
-        _check_delayed(arrays, self.max_delay)
+        if is_delayed:
+            _check_delayed(arrays, self.max_delay)
         # SB3's own method cannot reshape an action history of no actions, that of max_delay 0.
-        is_batch = batches["delay"] is not None
-        tensors = {
-            key: th.as_tensor(values if is_batch else values[None], device=self.device)
-            for key, values in arrays.items()
-        }
-        return tensors, is_batch
+        is_batch = batches["observation"] is not None
+        tensors = {key: th.as_tensor(x if is_batch else x[None], device=self.device) for key, x in arrays.items()}
+        return tensors if is_delayed else tensors["observation"], is_batch
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {
@@ -122,28 +108,22 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         }
 
 
-def _as_float32(name: str, values: Any) -> np.ndarray:
-    """Copy numbers to what the networks compute in, before they are looked at.
+def _as_float32(name: str, given: Any, space: spaces.Space[Any]) -> np.ndarray:
+    """Copy one element of a space, or a batch, to what the networks compute in. The space's bounds are not read.
 
-    1e300 is infinite there, and noise that an observation decides must not depend on the dtype it came in.
+    The checks follow the copy: 1e300 is infinite in float32, and noise that an observation decides must not depend on
+    the dtype it came in.
 
-    :raises ValueError: for strings and objects, or nested lists that are no array
+    :raises ValueError: for what is no array of real numbers, another shape, an empty batch, or entries not finite
     """
     try:
-        array = np.asarray(values)
+        array = np.asarray(given)
     except ValueError as error:
         raise ValueError(f"{name} cannot be made an array: {error}") from error
     if array.dtype.kind not in "biuf":
         raise ValueError(f"{name} holds {array.dtype}, expected real numbers.")
     with np.errstate(over="ignore"):  # refused with a reason next
-        return array.astype(np.float32)
-
-
-def _check_array(name: str, values: np.ndarray, space: spaces.Space[Any]) -> int | None:
-    """Refuse an array of another shape, an empty batch or one that is not finite. The space's bounds are not read.
-
-    :return: size of the batch, None for a single element
-    """
+        values = array.astype(np.float32)
     if values.shape != space.shape and values.shape[1:] != space.shape:
         raise ValueError(
             f"{name} has the shape {values.shape}, expected {space.shape}, or (n_envs, *{space.shape}) for a batch; "
@@ -155,7 +135,7 @@ def _check_array(name: str, values: np.ndarray, space: spaces.Space[Any]) -> int
         raise ValueError(
             f"{name} has entries that are NaN or infinite, in float32; find out where they come from first."
         )
-    return None if values.shape == space.shape else len(values)
+    return values
 
 
 def _check_delayed(arrays: dict[str, np.ndarray], max_delay: int) -> None:

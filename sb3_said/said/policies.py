@@ -14,7 +14,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
-from sb3_said.delays.space import UNDELAYED, check_spaces, has_state_history
+from sb3_said.delays.space import KEYS, STATE_KEYS, UNDELAYED, check_spaces, has_state_history
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner.graphs import EAGER_CALLS
 from sb3_said.sac.policies import DelayedSACPolicy
@@ -123,10 +123,10 @@ class SAIDPolicy(DelayedSACPolicy):
 
         :param repeats: let the observation, of one row, decide the noise
         """
-        state_history = state_known = None
+        extra: dict[str, Any] = {}
         if isinstance(observation, dict):
-            state_history, state_known = observation.get("state_history"), observation.get("state_known")
-            states, history, delay = (observation[key] for key in ("observation", "action_history", "delay"))
+            extra = {key: observation[key] for key in STATE_KEYS if key in observation}
+            states, history, delay = (observation[key] for key in KEYS)
             delay = delay[:, 0].long()
         else:
             states, history = observation, observation.new_zeros(len(observation), 0, self.planner.act_dim)
@@ -138,8 +138,7 @@ class SAIDPolicy(DelayedSACPolicy):
             delay,
             value_fn=self.value if chooses else None,
             noise=self._noise_of(observation) if chooses and repeats else None,
-            state_history=state_history,
-            state_known=state_known,
+            **extra,
         )
         return plan.action
 
@@ -170,7 +169,7 @@ class SAIDPolicy(DelayedSACPolicy):
         arrays = {key: np.zeros((batch_size, *(part.shape or ())), np.float32) for key, part in parts.items()}
         on_gpu = self.device.type == "cuda"
         calls = range(EAGER_CALLS + 1 if on_gpu else 1)
-        with th.random.fork_rng(devices=[self.device] if on_gpu else []):  # who draws afterwards draws the same
+        with th.random.fork_rng(devices=[self.device] if on_gpu else []):  # later draws stay the same
             for delay, deterministic, _ in product((0, self.max_delay), (True, False), calls):
                 if "delay" in arrays:
                     arrays["delay"][:] = delay

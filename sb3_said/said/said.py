@@ -8,10 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
-import numpy as np
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
-from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import configure_logger
@@ -92,25 +90,22 @@ class SAID(DelayedSAC):
         policy = getattr(self, "policy", None)
         return self._given_planner_kwargs if policy is None else policy.planner.config.to_dict()
 
-    def _check_parts(self) -> None:
-        super()._check_parts()
+    def _setup_model(self) -> None:
         vec_normalize = self.get_vec_normalize_env()
         if has_state_history(self.observation_space) and vec_normalize is not None and vec_normalize.norm_obs:
             raise ValueError(
                 "VecNormalize scales the observation and not the state_history, which must have the same units; use "
                 "VecNormalize(..., norm_obs=False), or leave state_history=False in DelayedObservationWrapper."
             )
-
-    def _policy_flags(self) -> dict[str, Any]:
-        return {**super()._policy_flags(), "planner_kwargs": self.planner_kwargs}
-
-    def _setup_model(self) -> None:
         super()._setup_model()
         if self.trained_ages is None and self.env is not None:  # else it was loaded, and check_ages says it
             try:
                 self.policy.planner.check_ages(ages_of(self.env))
             except ValueError as error:  # no error yet: the expert may learn under another delay
                 warnings.warn(str(error), stacklevel=3)
+
+    def _policy_flags(self) -> dict[str, Any]:
+        return {**super()._policy_flags(), "planner_kwargs": self.planner_kwargs}
 
     def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:
         """Keep this agent's own planner where the given one was never trained and has other settings."""
@@ -135,12 +130,13 @@ class SAID(DelayedSAC):
     ) -> SelfSAID:
         """Run the expert for ``total_timesteps``, then train the planner on what it stored.
 
-        A :class:`PlannerTrainingCallback` among the callbacks is used for the planner; otherwise one is added. The
+        A :class:`PlannerTrainingCallback` among the callbacks trains the planner, and otherwise one that is added. The
         expert answers all callbacks, such as ``EvalCallback``, also when the planner has been trained before.
         """
-        callbacks = as_callback_list(callback)
-        if not any(isinstance(c, PlannerTrainingCallback) for c in callbacks):
-            callbacks.append(PlannerTrainingCallback(progress_bar=progress_bar))
+        if not isinstance(callback, (BaseCallback, list, tuple)):
+            callback = [] if callback is None else ConvertCallback(callback)
+        callbacks = list(callback) if isinstance(callback, (list, tuple)) else [callback]
+        callbacks.append(PlannerTrainingCallback(progress_bar=progress_bar))  # after the user's it has nothing to do
         with self.policy.answering("expert"):
             return super().learn(
                 total_timesteps,
@@ -168,18 +164,15 @@ class SAID(DelayedSAC):
         self.policy.planner.config = replace(self.policy.planner.config, **settings)
 
     def check_ages(self, ages: list[int]) -> None:
-        """Refuse ages at which the planner, once trained, has no answer; warn where the expert knows none.
+        """Refuse ages that the planner cannot plan at, where it answers; warn as ``DelayedSAC`` where the expert does.
 
         :param ages: that it will meet amid episodes, in control steps
         :raises ValueError: as :meth:`InpaintingPlanner.check_ages`
         """
-        if self.policy.planner_is_trained:
+        if self.policy.who_answers == "planner":  # its masks were drawn from all of 0..D, so it has met every age
             self.policy.planner.check_ages(ages)
-        super().check_ages(ages)
-
-    def _serves(self, ages: list[int]) -> bool:
-        # Masks were drawn from all of 0..D, over true states that replay has at every age
-        return self.policy.who_answers == "planner"
+        else:
+            super().check_ages(ages)
 
     def warmup(self, batch_size: int = 1) -> None:
         """Run a few dummy predictions: see :meth:`SAIDPolicy.warmup`. A control loop calls it once before it starts.
@@ -272,20 +265,3 @@ class SAID(DelayedSAC):
         if trainer.n_updates > 0:  # else an earlier training's stays
             self.policy.planner_updates.fill_(float(trainer.n_updates))
         self._planner_trained_at = self.num_timesteps
-
-    def _sample_action(
-        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
-    ) -> tuple[np.ndarray, np.ndarray]:
-        with self.policy.answering("expert"):
-            return super()._sample_action(learning_starts, action_noise, n_envs)
-
-
-def as_callback_list(callback: MaybeCallback) -> list[BaseCallback]:
-    """Return callbacks in SB3's many forms as a list of callback objects."""
-    if callback is None:
-        return []
-    if isinstance(callback, CallbackList):
-        return list(callback.callbacks)
-    if isinstance(callback, (list, tuple)):
-        return list(callback)
-    return [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]
