@@ -102,7 +102,7 @@ def players_and_sizes(draw):
     return player, draw(st.integers(max_delay + 2, 30))
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(players_and_sizes(), st.integers(1, 90))
 def test_samples_are_the_transitions_themselves(player_and_size, n_steps):
     player, steps_per_env = player_and_size
@@ -110,7 +110,7 @@ def test_samples_are_the_transitions_themselves(player_and_size, n_steps):
     assert_exact(fill(make_buffer(player, steps_per_env), rows), rows)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(processes(), st.sampled_from(["newest", "independent"]), st.integers(0, 2**16), st.integers(2, 20))
 def test_samples_are_the_transitions_themselves_however_ages_jump(process, receiver, seed, spare):
     player = Player(delay=process, receiver=receiver, max_length=25, interruption=0.05, seed=seed)
@@ -131,7 +131,7 @@ def pasts_and_rows(rows):
     return found
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(players_and_sizes(), st.integers(1, 90), st.sampled_from([0.3, 1.0]))
 def test_relabelled_ages_show_what_would_have_been_observed_at_them(player_and_size, n_steps, part):
     player, steps_per_env = player_and_size

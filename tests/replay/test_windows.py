@@ -66,7 +66,7 @@ def assert_windows(source, starts, length):
     assert [x.dtype for x in windows] == [th.float32, th.float32, th.bool, th.float32]
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(
     n_envs=st.integers(1, 3),
     delay=st.sampled_from([1, (0, 3)]),
