@@ -46,7 +46,7 @@ class PlannerConfig:
     # Sampling
     sampling_steps: int = 5  # of DDIM; 99.6 % of the paper's return with 20
     n_candidates: int = 16  # measured; the paper's 50 cost three times as much
-    # Factor on the initial noise, >= 0; at 0 one candidate is drawn and nothing chosen. Measured (results/README.md):
+    # Factor on the initial noise, >= 0; at 0 one candidate is drawn and nothing chosen. Measured (results/settings.md):
     # choosing by the critics, which the expert's actor has already followed, led to falls; the paper tunes 0.1 to 1
     temperature: float = 0.0
     # "decision": the decision alone, at the present that the candidates agree on, so that actions compete and not
@@ -54,7 +54,7 @@ class PlannerConfig:
     # "all": all states but the first (paper)
     scored_states: str = "decision"
     # None: the candidate of the highest value decides (paper). A number beta >= 0: the candidates' mean does, weighed
-    # by exp(beta * z), z a candidate's value in standard deviations of all; 1 is better at long delays (docs/said.md)
+    # by exp(beta * z), z a candidate's value in standard deviations of all; 1 is better at long delays (results/settings.md)
     choice_factor: float | None = None
     # Training
     learning_rate: float = 2e-3  # measured at depth 2, together with the warm-up
@@ -68,7 +68,7 @@ class PlannerConfig:
     ema_warmup: bool = True  # without it 37 % of the initial weights remain after 10,000 steps
     weight_factor: float = 2.0  # paper: beta in the window weight exp(beta * (value - 1))
     # What that value is: "rank", the part of all windows that are worth less, so that beta picks as much of any data
-    # (measured, docs/said.md), or "range", between the lowest and the highest value of the data (paper)
+    # (measured, results/settings.md), or "range", between the lowest and the highest value of the data (paper)
     value_scale: str = "rank"
     precision: str = "auto"  # bfloat16 autocast where the hardware has it; or "float32", "bfloat16"
 

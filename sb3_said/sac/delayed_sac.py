@@ -46,7 +46,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
     :param delay_reconciled_critic: the critics read the true state
     :param relabelled_ages: part of an update's transitions, in [0, 1], that are shown at the age of another one: where
         delays vary, each step teaches the actor what to do under the others too. Measured at delays 0..16
-        (results/README.md); 0 is SADR as published. Under one fixed delay nothing changes
+        (results/any_delay_halfcheetah.md); 0 is SADR as published. Under one fixed delay nothing changes
     :param sac_kwargs: every other argument of :class:`stable_baselines3.SAC`
     :raises ValueError: for other spaces, a ``VecNormalize`` of more than the observation, or options that need another
         replay buffer (``n_steps`` > 1) or policy

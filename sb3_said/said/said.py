@@ -152,8 +152,8 @@ class SAID(DelayedSAC):
 
         ``model.set_planner(temperature=0.3, n_candidates=50)``
 
-        :param settings: ``sampling_steps``, ``n_candidates``, ``temperature``,
-            ``scored_states`` or ``choice_factor`` of :class:`~sb3_said.planner.PlannerConfig`
+        :param settings: ``sampling_steps``, ``n_candidates``, ``temperature``, ``scored_states`` or ``choice_factor``
+            of :class:`~sb3_said.planner.PlannerConfig`
         :raises ValueError: for other settings, which the weights depend on, and for values outside their range
         """
         if others := sorted(set(settings) - set(SAMPLING_SETTINGS)):
