@@ -54,7 +54,8 @@ class PlannerConfig:
     # "all": all states but the first (paper)
     scored_states: str = "decision"
     # None: the candidate of the highest value decides (paper). A number beta >= 0: the candidates' mean does, weighed
-    # by exp(beta * z), z a candidate's value in standard deviations of all; 1 is better at long delays (results/settings.md)
+    # by exp(beta * z), z a candidate's value in standard deviations of all; 1 is better at long delays (measured,
+    # results/settings.md)
     choice_factor: float | None = None
     # Training
     learning_rate: float = 2e-3  # measured at depth 2, together with the warm-up
