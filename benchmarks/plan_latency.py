@@ -112,7 +112,7 @@ def make_plain(setting: Setting, device: str, env: gym.Env[Any, Any]) -> Any:
 
 def sizes(env: gym.Env[Any, Any]) -> tuple[int, int]:
     """Return obs_dim and act_dim of a delayed task."""
-    return env.observation_space["observation"].shape[0], env.action_space.shape[0]  # type: ignore[index]
+    return env.observation_space["observation"].shape[0], env.action_space.shape[0]  # type: ignore[index]  # Boxes have a shape
 
 
 def observe(env: gym.Env[Any, Any], delay: int) -> dict[str, np.ndarray]:

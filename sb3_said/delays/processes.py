@@ -208,7 +208,7 @@ def as_process(delay: Delay) -> DelayProcess:
     :raises ValueError: for anything else
     """
     if _is_integer(delay):
-        return FixedDelay(delay)  # type: ignore[arg-type]
+        return FixedDelay(delay)  # type: ignore[arg-type]  # an integer, which mypy does not follow
     if isinstance(delay, (tuple, list)) and len(delay) == 2 and all(map(_is_integer, delay)):
         return EpisodeDelay(*delay)
     if hasattr(delay, "sample") and hasattr(delay, "max_delay"):

@@ -78,7 +78,7 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
                 f"got the keys {sorted(observation_space.keys())}; wrap the task in it."
             )
         state_space = observation_space["observation"]
-        max_delay = observation_space["action_history"].shape[0]  # type: ignore[index]
+        max_delay = observation_space["action_history"].shape[0]  # type: ignore[index]  # a Box has a shape
     return check_task(state_space, action_space)[0], max_delay
 
 

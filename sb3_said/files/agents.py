@@ -35,7 +35,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
     )  # fmt: skip
     own_classes: ClassVar[tuple[type, ...]] = ()
 
-    def save(self, path: PathOrFile) -> None:  # type: ignore[override]
+    def save(self, path: PathOrFile) -> None:  # type: ignore[override]  # without SB3's exclude and include
         """Write the agent to a file, without its environment and replay buffer.
 
         A constructor argument that cannot be written without pickle is named in a warning and in the file.
@@ -70,7 +70,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
         save_tree(path, tree, kind=type(self).__name__)
 
     @classmethod
-    def load(  # type: ignore[override]
+    def load(  # type: ignore[override]  # of files, too, that are open
         cls: type[SelfSafeSave],
         path: PathOrFile,
         env: GymEnv | None = None,
@@ -117,7 +117,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
         policy = (arguments := arguments | kwargs).pop("policy_class", cls.policy_aliases["MlpPolicy"])
         with readable(path, explained=(ValueError, AssertionError)):  # SB3 asserts what it needs of an environment
             arguments |= {"device": device, "_init_setup_model": False}
-            model = cls(policy, env, **arguments)  # type: ignore[arg-type]
+            model = cls(policy, env, **arguments)  # type: ignore[arg-type]  # SB3 takes no env, too
             _restore_counters(model, saved["counters"])  # _setup_model may ask whether the agent is new
             model.observation_space, model.action_space = observation_space, action_space
             if model.env is None:
@@ -127,7 +127,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
             if model.env is not None:
                 model.set_env(model.env)
         if model.use_sde:  # its noise was drawn before the parameters were there
-            model.policy.reset_noise()  # type: ignore[operator]
+            model.policy.reset_noise()  # type: ignore[operator]  # policies with gSDE have it
         return model
 
     def set_parameters(
@@ -195,7 +195,7 @@ class SafePolicyMixin(BasePolicy):
             policy.load_state_dict(saved["state_dict"])
         policy.to(get_device(device))
         if arguments.get("use_sde"):  # its noise was drawn before the parameters were there
-            policy.reset_noise()  # type: ignore[operator]
+            policy.reset_noise()  # type: ignore[operator]  # policies with gSDE have it
         return policy
 
 

@@ -382,7 +382,7 @@ class DelayedReplayBuffer(ReplayBuffer):
         fits = fits and all(state[name].shape[1:] == getattr(self, name).shape[1:] for name in _ROW_ARRAYS)
         if expected is not None:  # the observation that would continue the replay is of this buffer's task
             boxes = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
-            sizes = {key: self.n_envs * int(np.prod(box.shape)) for key, box in boxes.items()}  # type: ignore[arg-type]
+            sizes = {key: self.n_envs * int(np.prod(box.shape)) for key, box in boxes.items()}  # type: ignore[arg-type]  # Boxes
             fits = fits and sizes == {key: x.size for key, x in expected.items()}
         if not fits:
             raise ValueError(

@@ -196,4 +196,4 @@ class DelayedSAC(SafeSaveMixin, SAC):
         :param truncate_last_traj: of SB3's ``HerReplayBuffer``, without effect here
         :raises ValueError: when the file is no replay, or was made with another task, ``buffer_size`` or ``n_envs``
         """
-        self.replay_buffer.load_state_dict(load_tree(path))  # type: ignore[arg-type]
+        self.replay_buffer.load_state_dict(load_tree(path))  # type: ignore[arg-type]  # io.BufferedIOBase is IO
