@@ -42,7 +42,7 @@ class PlannerTrainingCallback(BaseCallback):
         # Here, and not in on_step, the replay buffer holds every step taken.
         freq, now = self.model.planner_train_freq, self.model.num_timesteps
         if freq is not None and now // freq > self.model._planner_trained_at // freq:
-            self.model.train_planner(**self.how)
+            self.model.train_planner(**self.how, trial_episodes=0)  # collection goes on, by the expert
 
     def _on_training_end(self) -> None:
         # A training that took no steps since the last one, or was ended twice, has nothing new to learn from.

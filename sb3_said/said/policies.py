@@ -25,7 +25,8 @@ Answer = Literal["planner", "expert"]
 class SAIDPolicy(DelayedSACPolicy):
     """The expert's policy with an inpainting planner on top.
 
-    Until the planner is trained the expert answers; after that the planner does, scored by the expert's critics.
+    Until the planner is trained the expert answers; after that the planner does, scored by the expert's critics, unless
+    :meth:`set_answer` says otherwise.
 
     :param planner_kwargs: fields of :class:`~sb3_said.planner.PlannerConfig`
     :param policy_kwargs: of :class:`~sb3_said.sac.DelayedSACPolicy`
@@ -34,6 +35,7 @@ class SAIDPolicy(DelayedSACPolicy):
     """
 
     planner_updates: th.Tensor
+    expert_preferred: th.Tensor
 
     def __init__(
         self,
@@ -54,6 +56,7 @@ class SAIDPolicy(DelayedSACPolicy):
         if unknown := sorted(set(given) - set(names)):
             raise ValueError(f"The planner has no setting {', '.join(unknown)}; it has {', '.join(names)}.")
         self.register_buffer("planner_updates", th.zeros(()))
+        self.register_buffer("expert_preferred", th.zeros(()))  # 1: it answers although the planner is trained
         with th.random.fork_rng(devices=[]):  # the expert learns as it would without a planner
             self.make_planner(PlannerConfig(**given))
         if has_state_history(observation_space) and self.planner.config.extra_state_probability == 0:
@@ -70,16 +73,26 @@ class SAIDPolicy(DelayedSACPolicy):
         obs_dim, act_dim = state_space.shape[0], self.action_space.shape[0]  # type: ignore[index]  # a Box has a shape
         self.planner = InpaintingPlanner(obs_dim, act_dim, max_delay, config).to(self.device).requires_grad_(False)
         self.planner_updates.zero_()
+        self.expert_preferred.zero_()
 
     @property
     def planner_is_trained(self) -> bool:
-        """Whether the planner has been trained, and so answers."""
+        """Whether the planner has been trained, and so can answer."""
         return bool(self.planner_updates > 0)
 
     @property
     def who_answers(self) -> Answer:
         """Who answers ``predict``."""
-        return self._answer or ("planner" if self.planner_is_trained else "expert")
+        return self._answer or ("planner" if self.planner_is_trained and not self.expert_preferred else "expert")
+
+    def set_answer(self, who: Answer) -> None:
+        """Let the planner or the expert answer ``predict`` from now on; a file keeps it.
+
+        :param who: ``"planner"`` or ``"expert"``
+        :raises ValueError: for another name, or for a planner that is not trained
+        """
+        self._check_answer(who)
+        self.expert_preferred.fill_(float(who == "expert"))
 
     @contextmanager
     def answering(self, who: Answer) -> Iterator[None]:
@@ -88,15 +101,18 @@ class SAIDPolicy(DelayedSACPolicy):
         :param who: ``"planner"`` or ``"expert"``
         :raises ValueError: for another name, or for a planner that is not trained
         """
-        if who not in get_args(Answer):
-            raise ValueError(f"Only the 'planner' or the 'expert' can answer, got {who!r}.")
-        if who == "planner" and not self.planner_is_trained:
-            raise ValueError("The planner is not trained yet; call learn() or train_planner() first.")
+        self._check_answer(who)
         before, self._answer = self._answer, who
         try:
             yield
         finally:
             self._answer = before
+
+    def _check_answer(self, who: Answer) -> None:
+        if who not in get_args(Answer):
+            raise ValueError(f"Only the 'planner' or the 'expert' can answer, got {who!r}.")
+        if who == "planner" and not self.planner_is_trained:
+            raise ValueError("The planner is not trained yet; call learn() or train_planner() first.")
 
     def value(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """Return min over the critics of Q(s, a), which scores candidates (MCSS) and bootstraps trajectory weights.

@@ -22,7 +22,8 @@ from sb3_said.planner.trainer import PlannerTrainer, worse_than_regression
 from sb3_said.planner.values import returns_to_go
 from sb3_said.sac import DelayedSAC
 from sb3_said.said.callbacks import PlannerTrainingCallback
-from sb3_said.said.policies import SAIDPolicy
+from sb3_said.said.policies import Answer, SAIDPolicy
+from sb3_said.said.trial import let_the_better_answer
 
 HELD_OUT = 0.05  # of the planner's data, in whole episodes
 PLANNER_CHECKPOINT_NAME = "planner_checkpoint.zip"
@@ -31,11 +32,12 @@ SelfSAID = TypeVar("SelfSAID", bound="SAID")
 
 
 class SAID(DelayedSAC):
-    """State-Action Inpainting Diffuser, online (paper, Algorithm 2).
+    """State-Action Inpainting Diffuser, online (paper, Algorithm 1).
 
     ``learn`` runs the expert (SADR), then trains a diffusion transformer on windows of its replay buffer. ``predict``
-    asks the expert until the planner is trained, and the planner from then on: it inpaints what the delay hides and the
-    plan behind it; at a temperature above 0 many times, and the critics choose. Collection always uses the expert.
+    asks the expert until the planner is trained, and then whoever of the two does better in a few episodes. The planner
+    inpaints what the delay hides and the plan behind it; at a temperature above 0 many times, and the critics choose.
+    Collection always uses the expert.
 
     :param policy: ``"MultiInputPolicy"`` or ``"MlpPolicy"``, which name the same class
     :param env: a task in a ``DelayedObservationWrapper``, or one with a 1-D Box observation (delay 0)
@@ -47,6 +49,8 @@ class SAID(DelayedSAC):
         as all; here it is better, where policies change fast
     :param planner_terminal_penalty: replaces the reward of a terminating step in the values that weigh windows (paper,
         Table 5); None keeps it, for tasks that end when they are done
+    :param planner_trial_episodes: of the training environment, played with the planner after its training and as many
+        with the expert; the better one answers. They come on top of ``learn``'s steps. 0: the planner answers
     :param sac_kwargs: every other argument of :class:`~sb3_said.sac.DelayedSAC` and of SB3's ``SAC``
     :raises ValueError: as ``DelayedSAC`` does, for planner settings outside their range, and for a ``state_history``
         in the observations that the planner is not trained to read or that ``VecNormalize`` leaves unscaled
@@ -67,6 +71,7 @@ class SAID(DelayedSAC):
         planner_train_freq: int | None = None,
         planner_newest_fraction: float = 0.2,
         planner_terminal_penalty: float | None = -100.0,
+        planner_trial_episodes: int = 5,
         **sac_kwargs: Any,
     ):
         for name, value in (("gradient_steps", planner_gradient_steps), ("train_freq", planner_train_freq)):
@@ -76,11 +81,14 @@ class SAID(DelayedSAC):
             raise ValueError(
                 f"planner_newest_fraction is a part of the buffer in (0, 1], got {planner_newest_fraction}."
             )
+        if planner_trial_episodes < 0:
+            raise ValueError(f"planner_trial_episodes must be 0 or more, got {planner_trial_episodes}.")
         self._given_planner_kwargs = planner_kwargs or {}
         self.planner_gradient_steps = planner_gradient_steps
         self.planner_train_freq = planner_train_freq
         self.planner_newest_fraction = planner_newest_fraction
         self.planner_terminal_penalty = planner_terminal_penalty
+        self.planner_trial_episodes = planner_trial_episodes
         self._planner_trained_at = 0  # num_timesteps of the last planner training
         super().__init__(policy, env, learning_rate, **sac_kwargs)
 
@@ -163,6 +171,10 @@ class SAID(DelayedSAC):
             )
         self.policy.planner.config = replace(self.policy.planner.config, **settings)
 
+    def set_answer(self, who: Answer) -> None:
+        """Let the planner or the expert answer ``predict`` from now on: see :meth:`SAIDPolicy.set_answer`."""
+        self.policy.set_answer(who)
+
     def check_ages(self, ages: list[int]) -> None:
         """Refuse ages that the planner cannot plan at, where it answers; warn as ``DelayedSAC`` where the expert does.
 
@@ -212,8 +224,9 @@ class SAID(DelayedSAC):
         log_interval: int = 500,
         eval_interval: int = 2_000,
         save_interval: int = 1_000,
+        trial_episodes: int | None = None,
     ) -> None:
-        """Train the planner on the replay buffer as it is, without running the expert.
+        """Train the planner on the replay buffer as it is, without running the expert; then see who answers better.
 
         Interrupting (Ctrl-C) ends the training early and keeps the planner as far as it got.
 
@@ -223,6 +236,7 @@ class SAID(DelayedSAC):
         :param log_interval: updates between two rows of losses in the log
         :param eval_interval: updates between two measurements of the held-out errors, beside the regression's
         :param save_interval: updates between two checkpoints
+        :param trial_episodes: ``planner_trial_episodes`` by default; none are played where there is no environment
         :raises ValueError: when the buffer is empty, or the checkpoint is of a training with other settings
         """
         if not hasattr(self, "_logger"):  # not set_logger: learn() makes its own
@@ -264,4 +278,8 @@ class SAID(DelayedSAC):
                 print(f"Planner training interrupted after {trainer.n_updates} of {total} updates; its weights stay.")
         if trainer.n_updates > 0:  # else an earlier training's stays
             self.policy.planner_updates.fill_(float(trainer.n_updates))
+            n_episodes = self.planner_trial_episodes if trial_episodes is None else trial_episodes
+            self.set_answer("planner")
+            if n_episodes > 0 and self.env is not None:
+                let_the_better_answer(self, n_episodes, progress_bar)
         self._planner_trained_at = self.num_timesteps

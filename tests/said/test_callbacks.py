@@ -27,6 +27,7 @@ def make(**kwargs):
         "planner_kwargs": PLANNER,
         "planner_gradient_steps": 6,
         "planner_newest_fraction": 1.0,
+        "planner_trial_episodes": 0,
     }
     return SAID("MlpPolicy", env, **(arguments | kwargs))
 

@@ -25,6 +25,7 @@ def make(env=None, cls=SAID, policy="MlpPolicy", planner_kwargs=(), **kwargs):
             "planner_kwargs": PLANNER | dict(planner_kwargs),
             "planner_gradient_steps": 5,
             "planner_newest_fraction": 1.0,
+            "planner_trial_episodes": 0,
         }
     return cls(policy, delayed() if env is None else env, **(arguments | kwargs))
 

@@ -22,7 +22,7 @@ def write_run(folder: Path, cls: type[DelayedSAC], delay: int, steps: int = 60, 
     """
     wrapper: dict[str, Any] = {"delay": delay}
     if cls is SAID:
-        kwargs = {"planner_kwargs": TINY_PLANNER, "planner_gradient_steps": 2, **kwargs}
+        kwargs = {"planner_kwargs": TINY_PLANNER, "planner_gradient_steps": 2, "planner_trial_episodes": 0, **kwargs}
     kwargs = {"learning_starts": 50, "buffer_size": 500, "device": "cpu", **kwargs}
     model = cls("MultiInputPolicy", DelayedObservationWrapper(gym.make(ENV), **wrapper), seed=seed, **kwargs)
     model.learn(steps)

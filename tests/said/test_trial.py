@@ -1,0 +1,112 @@
+"""The trial after the planner's training: it measures what evaluate_policy does, and the better one answers."""
+
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from small_agent import answer, make, observe
+from small_task import delayed
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_said import SAID, DelayedObservationWrapper
+from sb3_said.said import trial
+
+
+def rigged(monkeypatch, planner, expert):
+    played = {"planner": np.array(planner), "expert": np.array(expert)}
+    monkeypatch.setattr(trial, "play_trial", lambda *_: played)
+
+
+def pendulum():
+    return DelayedObservationWrapper(gym.make("Pendulum-v1", max_episode_steps=15), 2)
+
+
+@pytest.fixture(scope="module")
+def trained():
+    return make(env=pendulum()).learn(60)
+
+
+def test_returns_are_those_of_each_who_can_answer(trained):
+    np.random.seed(3)
+    played = trial.play_trial(trained, n_episodes=3)
+    np.random.seed(3)
+    seed = int(np.random.randint(2**31))
+    for who, returns in played.items():
+        env = DummyVecEnv([lambda: Monitor(pendulum())])
+        env.seed(seed)
+        with trained.policy.answering(who):
+            expected = evaluate_policy(trained, env, 3, return_episode_rewards=True)[0]
+        np.testing.assert_allclose(returns, expected, rtol=1e-5)
+    assert not np.allclose(played["planner"], played["expert"])
+
+
+@pytest.mark.parametrize("better", ["planner", "expert"])
+def test_the_better_one_answers_also_after_saving(better, monkeypatch, tmp_path):
+    rigged(monkeypatch, planner=[0.0, 3.0] if better == "planner" else [0.0, 1.0], expert=[1.0, 1.0])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model = make(planner_trial_episodes=2).learn(60)
+    worse = [str(w.message) for w in caught if "worse than its expert" in str(w.message)]
+    assert len(worse) == (better == "expert")
+    assert model.policy.who_answers == better
+    model.save(tmp_path / "agent.zip")
+    loaded = SAID.load(tmp_path / "agent.zip", device="cpu")
+    assert loaded.policy.who_answers == better
+    obs = observe()
+    np.testing.assert_array_equal(answer(loaded, obs), answer(model, obs))
+    loaded.set_answer("expert" if better == "planner" else "planner")
+    assert not np.array_equal(answer(loaded, obs), answer(model, obs))
+
+
+def test_a_new_training_gives_the_planner_another_chance(monkeypatch):
+    rigged(monkeypatch, planner=[0.0], expert=[1.0])
+    with pytest.warns(UserWarning, match="worse than its expert"):
+        model = make(planner_trial_episodes=1).learn(60)
+    rigged(monkeypatch, planner=[1.0], expert=[0.0])
+    model.train_planner()
+    assert model.policy.who_answers == "planner"
+
+
+def test_no_episodes_and_no_environment_leave_the_planner(trained, monkeypatch):
+    monkeypatch.setattr(trial, "play_trial", lambda *_: pytest.fail("played"))
+    model = make(planner_trial_episodes=0).learn(60)
+    assert model.policy.who_answers == "planner"
+    model.planner_trial_episodes, model.env = 3, None
+    model.train_planner()
+    assert model.policy.who_answers == "planner"
+    with pytest.raises(ValueError, match="-1"):
+        make(planner_trial_episodes=-1)
+
+
+def test_the_trial_is_no_training(monkeypatch):
+    """Neither steps, replay nor VecNormalize's statistics move, and learning starts anew afterwards."""
+    env = VecNormalize(DummyVecEnv([lambda: Monitor(delayed())]), norm_obs_keys=["observation"])
+    model = make(env=env, planner_trial_episodes=0).learn(60)
+    before = env.obs_rms["observation"].mean.copy(), env.ret_rms.var, model.replay_buffer.size()
+    trial.play_trial(model, n_episodes=2)
+    assert env.training
+    np.testing.assert_array_equal(env.obs_rms["observation"].mean, before[0])
+    assert (env.ret_rms.var, model.replay_buffer.size(), model.num_timesteps) == (*before[1:], 60)
+    model.learn(20, reset_num_timesteps=False)
+    assert model.num_timesteps == 80
+
+
+def test_only_the_last_training_of_many_is_tried(monkeypatch):
+    """While collection goes on its episode must not be cut."""
+    calls, played = [], {"planner": np.ones(1), "expert": np.zeros(1)}
+    monkeypatch.setattr(trial, "play_trial", lambda *args: calls.append(args) or played)
+    make(planner_trial_episodes=1, planner_train_freq=20).learn(60)
+    assert len(calls) == 1
+
+
+def test_the_same_seed_gives_the_same_trial():
+    def returns():
+        model = make(env=pendulum()).learn(60)
+        return trial.play_trial(model, n_episodes=2)
+
+    first, second = returns(), returns()
+    for who in first:
+        np.testing.assert_array_equal(first[who], second[who])
