@@ -123,7 +123,7 @@ def main(argv: list[str] | None = None) -> None:
     add_run(parser, episodes=1)
     parser.add_argument("--record", type=Path, metavar="FILE", help="write a video (.mp4 or .gif) instead of a window")
     parser.add_argument("--fps", type=int, default=25, help="frames a second, at most one a step (default: 25)")
-    parser.add_argument("--answer", choices=ANSWERS, help="who acts in a SAID agent (default: the trained planner)")
+    parser.add_argument("--answer", choices=ANSWERS, help="who acts in a SAID agent (default: as it was saved)")
     args = parser.parse_args(argv)
     displays = [name for name in ("DISPLAY", "WAYLAND_DISPLAY") if os.environ.get(name)]
     if sys.platform.startswith("linux") and not displays:
