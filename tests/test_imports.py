@@ -19,6 +19,7 @@ MAY_IMPORT = {
     "files": set(),
     "sac": {"delays", "replay", "files"},
     "said": {"delays", "replay", "planner", "files", "sac"},
+    "offline": {"delays", "replay"},
     "evaluation": set(),
     "zoo": {"", "delays", "replay", "planner", "files", "sac", "said", "evaluation"},
 }

@@ -1,0 +1,156 @@
+"""Implicit Q-learning (Kostrikov et al., ICLR 2022, https://arxiv.org/abs/2110.06169): values from logged steps alone."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch as th
+from stable_baselines3.common.utils import polyak_update
+from torch import nn
+from torch.nn import functional as F
+
+
+class Transitions(NamedTuple):
+    """A batch of B steps of a task without delay, in environment units."""
+
+    states: th.Tensor  # (B, obs_dim)
+    actions: th.Tensor  # (B, act_dim), in [-1, 1]
+    rewards: th.Tensor  # (B,)
+    next_states: th.Tensor  # (B, obs_dim)
+    terminated: th.Tensor  # (B,) float32, 1 where the task itself ended
+
+
+@dataclass(frozen=True)
+class IQLConfig:
+    """Settings of the values; their sources in parentheses."""
+
+    expectile: float = 0.7
+    """tau of the expectile regression, in [0.5, 1); 0.5 is the mean (SAID paper, Table 3: iql_tau)"""
+    hidden: int = 256
+    """width of the two hidden layers, each with LayerNorm and Mish (CleanDiffuser, utils/iql.py)"""
+    learning_rate: float = 3e-4
+    """of Adam, for V and Q (IQL, CleanDiffuser)"""
+    target_rate: float = 0.005
+    """part by which target critics move to the critics (IQL, CleanDiffuser: 0.995 kept)"""
+    batch_size: int = 256
+    """steps of an update (IQL, SAID paper)"""
+
+    def __post_init__(self) -> None:
+        if not 0.5 <= self.expectile < 1.0:
+            raise ValueError(f"expectile is {self.expectile}, expected 0.5 (the mean) up to, not with, 1.")
+
+
+class ImplicitValues(nn.Module):
+    """V(s), and the Q(s, a) it is learned from, without asking about an action that is not in the data.
+
+    V is the expectile of Q over the data's actions: with tau near 1, that of the best of them. Inputs are z-scored and
+    rewards scaled by :meth:`fit`; values are in the environment's units.
+
+    :param obs_dim: entries of a state
+    :param act_dim: entries of an action
+    :param config: settings
+    """
+
+    def __init__(self, obs_dim: int, act_dim: int, config: IQLConfig = IQLConfig()):  # noqa: B008  # frozen
+        super().__init__()
+        self.config = config
+        self.v = _network(obs_dim, config.hidden)
+        self.q = nn.ModuleList(_network(obs_dim + act_dim, config.hidden) for _ in range(2))
+        self.q_target = copy.deepcopy(self.q).requires_grad_(False)
+        self.register_buffer("mean", th.zeros(obs_dim))
+        self.register_buffer("std", th.ones(obs_dim))
+        self.register_buffer("scale", th.ones(()))
+
+    mean: th.Tensor
+    std: th.Tensor
+    scale: th.Tensor
+
+    @th.no_grad()
+    def fit(self, states: th.Tensor, returns: th.Tensor) -> None:
+        """Take over how states and trajectory returns are spread.
+
+        :param states: (M, obs_dim)
+        :param returns: (n_trajectories,); rewards are multiplied by 1000 / (largest - smallest), as IQL does on MuJoCo
+        """
+        std, mean = th.std_mean(states, dim=0)
+        self.mean.copy_(mean)
+        self.std.copy_(th.where(std > 1e-6, std, 1.0))
+        spread = returns.max() - returns.min()
+        self.scale.copy_(1000.0 / spread if spread > 0 else th.ones(()))
+
+    def value(self, states: th.Tensor) -> th.Tensor:
+        """Return V(s) as the environment's rewards would sum up.
+
+        :param states: (..., obs_dim)
+        :return: (...)
+        """
+        return self.v(self._z(states))[..., 0] / self.scale
+
+    def q_value(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """Return the smaller of both Q(s, a): (...)."""
+        x = th.cat([self._z(states), actions], dim=-1)
+        return th.minimum(*(q(x)[..., 0] for q in self.q)) / self.scale
+
+    def losses(self, batch: Transitions, gamma: float) -> dict[str, th.Tensor]:
+        """Return the losses of V (equation 5) and Q (equation 6), in scaled rewards.
+
+        :param batch: B steps
+        :param gamma: discount factor
+        """
+        z, next_z = self._z(batch.states), self._z(batch.next_states)
+        x = th.cat([z, batch.actions], dim=-1)
+        with th.no_grad():
+            target_q = th.minimum(*(q(x)[:, 0] for q in self.q_target))  # (B,)
+            next_v = self.v(next_z)[:, 0]
+        v_loss = expectile_loss(target_q - self.v(z)[:, 0], self.config.expectile)
+        y = batch.rewards * self.scale + gamma * (1.0 - batch.terminated) * next_v  # (B,)
+        q_loss = sum((F.mse_loss(q(x)[:, 0], y) for q in self.q), start=y.new_zeros(()))
+        return {"v_loss": v_loss, "q_loss": q_loss}
+
+    def _z(self, states: th.Tensor) -> th.Tensor:
+        return (states - self.mean) / self.std
+
+
+class IQL:
+    """Trains :class:`ImplicitValues`, one batch a call.
+
+    :param values: what to train
+    :param gamma: discount factor
+    """
+
+    def __init__(self, values: ImplicitValues, gamma: float):
+        self.values, self.gamma = values, gamma
+        trained = [*values.v.parameters(), *values.q.parameters()]
+        self.optimizer = th.optim.Adam(trained, lr=values.config.learning_rate)
+
+    def update(self, batch: Transitions) -> dict[str, float]:
+        """Make one step of gradient descent, and move the target critics.
+
+        :return: both losses
+        """
+        losses = self.values.losses(batch, self.gamma)
+        self.optimizer.zero_grad()
+        sum(losses.values(), start=th.zeros(())).backward()
+        self.optimizer.step()
+        polyak_update(self.values.q.parameters(), self.values.q_target.parameters(), self.values.config.target_rate)
+        return {name: loss.item() for name, loss in losses.items()}
+
+
+def expectile_loss(difference: th.Tensor, expectile: float) -> th.Tensor:
+    """Return the mean of |tau - 1(u < 0)| u^2, whose minimum over V of u = Q - V is the tau-expectile of Q.
+
+    :param difference: (B,) u
+    :param expectile: tau
+    """
+    weight = th.where(difference < 0, 1.0 - expectile, expectile)
+    return (weight * difference**2).mean()
+
+
+def _network(n_in: int, hidden: int) -> nn.Sequential:
+    return nn.Sequential(
+        *(nn.Linear(n_in, hidden), nn.LayerNorm(hidden), nn.Mish()),
+        *(nn.Linear(hidden, hidden), nn.LayerNorm(hidden), nn.Mish()),
+        nn.Linear(hidden, 1),
+    )

@@ -1,0 +1,242 @@
+"""Every source gives the same trajectories, and what is no log of the task is refused with its row."""
+
+import h5py
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3.common.buffers import ReplayBuffer
+
+from sb3_said.delays.space import delayed_space
+from sb3_said.offline import Dataset, load_dataset
+
+STATES = spaces.Box(-np.inf, np.inf, (3,), np.float32)
+ACTIONS = spaces.Box(np.float32([-2.0, 0.0]), np.float32([2.0, 1.0]))
+
+
+def make_log(lengths=(5, 1, 7), terminated=(True, False, False), seed=0):
+    """Return columns with next observations; actions in the task's own units."""
+    rng = np.random.default_rng(seed)
+    columns = {key: [] for key in ("observations", "actions", "rewards", "terminals", "timeouts", "next_observations")}
+    for length, is_terminal in zip(lengths, terminated, strict=True):
+        states = rng.normal(size=(length + 1, 3)).astype(np.float32)
+        last = np.arange(length) == length - 1
+        columns["observations"].append(states[:-1])
+        columns["next_observations"].append(states[1:])
+        columns["actions"].append(rng.uniform(ACTIONS.low, ACTIONS.high, (length, 2)).astype(np.float32))
+        columns["rewards"].append(rng.normal(size=length).astype(np.float32))
+        columns["terminals"].append(last & is_terminal)
+        columns["timeouts"].append(last & (not is_terminal))
+    return {key: np.concatenate(parts) for key, parts in columns.items()}
+
+
+def scale(actions):
+    """Map [-2, 2] and [0, 1] to [-1, 1]."""
+    return actions * np.float32([0.5, 2.0]) - np.float32([0.0, 1.0])
+
+
+def load(source, **kwargs):
+    return load_dataset(source, STATES, ACTIONS, **kwargs)
+
+
+def same(first, second):
+    for name in ("states", "actions", "rewards", "terminated", "ends", "finals"):
+        np.testing.assert_allclose(getattr(first, name), getattr(second, name), rtol=0, atol=1e-6, err_msg=name)
+
+
+@pytest.fixture
+def log():
+    return make_log()
+
+
+def write(path, columns):
+    if path.suffix == ".npz":
+        np.savez_compressed(path, **columns)
+    else:
+        with h5py.File(path, "w") as file:
+            for key, value in columns.items():
+                file[key] = value
+            file["metadata/algorithm"] = "none"  # D4RL's files hold groups, too
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".hdf5"])
+def test_a_file_keeps_ends_and_terminal_states_apart(suffix, log, tmp_path):
+    data = load(write(tmp_path / f"log{suffix}", log))
+    assert data.lengths.tolist() == [5, 1, 7]
+    assert data.terminated.nonzero()[0].tolist() == [4]
+    np.testing.assert_array_equal(data.states, log["observations"])
+    np.testing.assert_allclose(data.actions, scale(log["actions"]), atol=1e-6)
+    np.testing.assert_array_equal(data.finals, log["next_observations"][[4, 5, 12]])
+    np.testing.assert_allclose(data.returns, [log["rewards"][:5].sum(), log["rewards"][5], log["rewards"][6:].sum()])
+
+
+def test_without_next_observations_a_time_limit_costs_its_last_step(log, tmp_path):
+    del log["next_observations"]
+    data = load(write(tmp_path / "log.npz", log))
+    assert data.lengths.tolist() == [5, 6] and data.terminated.nonzero()[0].tolist() == [4]
+    np.testing.assert_array_equal(data.finals[1], log["observations"][12])  # its own last state ends it
+    np.testing.assert_array_equal(data.states, np.delete(log["observations"], [5, 12], axis=0))
+
+
+def test_other_names_mean_the_same(log, tmp_path):
+    renamed = dict(
+        zip(("obs", "actions", "rewards", "terminations", "truncations", "next_obs"), log.values(), strict=True)
+    )
+    same(load(write(tmp_path / "a.npz", log)), load(write(tmp_path / "b.npz", renamed)))
+
+
+@pytest.mark.parametrize("delay", [0, 2])
+def test_a_replay_gives_back_what_it_was_filled_with(delay, log, tmp_path):
+    data = load(write(tmp_path / "log.npz", log))
+    space = delayed_space(STATES, ACTIONS, delay) if delay else STATES
+    buffer = data.to_replay(space, ACTIONS)
+    same(load(buffer), data)
+    source = buffer.window_source()
+    assert sorted(source.remaining.tolist()) == sorted([*range(1, 6), 1, *range(1, 8)])
+    np.testing.assert_array_equal(source.start_states().numpy(), data.states)
+
+
+def test_a_replay_samples_what_followed_each_step(log, tmp_path):
+    data = load(write(tmp_path / "log.npz", log))
+    buffer = data.to_replay(delayed_space(STATES, ACTIONS, 2), ACTIONS, lambda n: np.minimum(np.arange(n + 1), 2))
+    followed = {
+        x.tobytes(): (y, d)
+        for x, y, d in zip(log["observations"], log["next_observations"], log["terminals"], strict=True)
+    }
+    where = {x.tobytes(): i for i, x in enumerate(log["observations"])}
+    batch = buffer.sample(200)
+    starts = np.repeat([0, 5, 6], data.lengths)
+    for i, state in enumerate(batch.observations["undelayed_observation"].numpy()):
+        next_state, is_terminal = followed[state.tobytes()]
+        np.testing.assert_array_equal(batch.next_observations["undelayed_observation"][i], next_state)
+        assert bool(batch.dones[i]) == is_terminal
+        row = where[state.tobytes()]
+        age = min(row - starts[row], 2)
+        assert batch.observations["delay"][i] == age
+        np.testing.assert_array_equal(batch.observations["observation"][i], log["observations"][row - age])
+        assert batch.next_observations["delay"][i] == min(row - starts[row] + 1, 2)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.tuples(st.integers(1, 6), st.booleans()), min_size=1, max_size=6), st.integers(0, 3))
+def test_any_trajectories_survive_the_replay(trajectories, delay):
+    lengths, terminated = zip(*trajectories, strict=True)
+    columns = make_log(lengths, terminated)
+    ends = columns["terminals"] | columns["timeouts"]
+    data = Dataset(
+        columns["observations"],
+        scale(columns["actions"]),
+        columns["rewards"],
+        columns["terminals"],
+        ends,
+        columns["next_observations"][ends],
+    )
+    space = delayed_space(STATES, ACTIONS, delay) if delay else STATES
+    same(load(data.to_replay(space, ACTIONS)), data)
+
+
+@pytest.mark.parametrize("n_added", [6, 20], ids=["filling", "wrapped"])
+def test_a_buffer_of_sb3_is_read_oldest_first(n_added):
+    log, rng = make_log((9, 11), (True, False)), np.random.default_rng(0)
+    buffer = ReplayBuffer(28, STATES, ACTIONS, n_envs=2, device="cpu")  # 14 steps of each environment
+    other = rng.normal(size=(21, 3)).astype(np.float32)
+    scaled = scale(log["actions"])
+    for i in range(n_added):
+        done = np.array([log["terminals"][i] or log["timeouts"][i], False])
+        infos = [{"TimeLimit.truncated": bool(log["timeouts"][i])}, {}]
+        obs = np.stack([log["observations"][i], other[i]])
+        next_obs = np.stack([log["next_observations"][i], other[i + 1]])
+        buffer.add(obs, next_obs, np.stack([scaled[i]] * 2), np.full(2, log["rewards"][i]), done, infos)
+    data, first = load(buffer), max(0, n_added - 14)
+    n = n_added - first
+    assert len(data) == 2 * n
+    np.testing.assert_array_equal(
+        data.states, np.concatenate([log["observations"][first:n_added], other[first:n_added]])
+    )
+    np.testing.assert_allclose(data.actions[:n], scaled[first:n_added], atol=1e-6)
+    expected = (log["terminals"] | log["timeouts"])[first:n_added]
+    expected[-1] = True
+    assert (
+        data.ends[:n].tolist() == expected.tolist()
+        and data.terminated[:n].tolist() == log["terminals"][first:n_added].tolist()
+    )
+
+
+def test_a_minari_dataset_is_read_by_its_id(log, tmp_path, monkeypatch):
+    minari = pytest.importorskip("minari")
+    from minari.data_collector.episode_buffer import EpisodeBuffer
+
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    episodes, start = [], 0
+    for i, length in enumerate((5, 1, 7)):
+        rows = slice(start, start + length)
+        start += length
+        states = np.concatenate([log["observations"][rows], log["next_observations"][rows][-1:]])
+        episodes.append(
+            EpisodeBuffer(
+                id=i,
+                seed=0,
+                observations=states,
+                actions=log["actions"][rows],
+                rewards=list(log["rewards"][rows]),
+                terminations=list(log["terminals"][rows]),
+                truncations=list(log["timeouts"][rows]),
+            )
+        )
+    minari.create_dataset_from_buffers(
+        "test/log-v0", episodes, observation_space=STATES, action_space=ACTIONS, env="Pendulum-v1"
+    )
+    same(load("test/log-v0"), load(write(tmp_path / "log.npz", log)))
+    with pytest.raises(ValueError, match="test/log-v0 is of Pendulum-v1, and the task is Hopper-v5"):
+        load("test/log-v0", env_id="Hopper-v5")
+    with pytest.raises(ValueError, match=r"no dataset 'test/nothing-v0'.*test/log-v0"):
+        monkeypatch.setattr(minari, "load_dataset", lambda *_, **__: (_ for _ in ()).throw(FileNotFoundError("none")))
+        load("test/nothing-v0")
+
+
+def test_several_sources_are_joined(log, tmp_path):
+    path = write(tmp_path / "log.npz", log)
+    joined = load([path, load(path)])
+    assert joined.lengths.tolist() == [5, 1, 7] * 2 and len(joined.finals) == 6
+
+
+def broken(log, key, row, value):
+    log[key] = log[key].copy()
+    log[key][row] = value
+    return log
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda log: broken(log, "rewards", 7, np.nan), r"Row 7 of .*log\.npz: rewards is nan"),
+        (lambda log: broken(log, "observations", (3, 1), np.inf), "Row 3 of .*: observations is .*inf"),
+        (lambda log: broken(log, "actions", (2, 0), 2.5), r"Row 2 of .*: the action \[2.5.* is outside the bounds"),
+        (lambda log: broken(log, "actions", (slice(4, 6), 1), -0.5), r"Row 4 .*\(2 rows like this\)"),
+        (lambda log: broken(log, "timeouts", 5, False), "Row 5 of .*: its next observation is not the one of row 6"),
+        (lambda log: log | {"rewards": log["rewards"][:-1]}, "differ in length"),
+        (lambda log: log | {"observations": log["observations"][:, :2]}, r"observations of shape \(2,\), and the task \(3,\)"),
+        (lambda log: {k: v for k, v in log.items() if k != "actions"}, "none of actions"),
+        (lambda log: {k: v for k, v in log.items() if k != "timeouts"} | {"dones": log["timeouts"]}, "'dones' do not say"),
+        (lambda log: {k: v[:0] for k, v in log.items()}, "or are empty"),
+    ],
+)  # fmt: skip
+def test_what_is_no_log_of_the_task_is_refused(change, message, log, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        load(write(tmp_path / "log.npz", change(log)))
+
+
+def test_no_file_and_no_step_are_said():
+    with pytest.raises(FileNotFoundError, match="no dataset nothing.npz"):
+        load("nothing.npz")
+    with pytest.raises(ValueError, match="list of datasets is empty"):
+        load([])
+
+
+def test_a_log_of_single_steps_without_what_followed_has_nothing(tmp_path):
+    log = make_log((1, 1), (False, False))
+    del log["next_observations"]
+    with pytest.raises(ValueError, match="no step whose next state is known"):
+        load(write(tmp_path / "log.npz", log))
