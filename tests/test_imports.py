@@ -19,7 +19,7 @@ MAY_IMPORT = {
     "files": set(),
     "sac": {"delays", "replay", "files"},
     "said": {"delays", "replay", "planner", "files", "sac"},
-    "offline": {"delays", "replay"},
+    "offline": {"delays", "replay", "sac"},
     "evaluation": set(),
     "zoo": {"", "delays", "replay", "planner", "files", "sac", "said", "evaluation"},
 }

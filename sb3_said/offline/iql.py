@@ -1,4 +1,4 @@
-"""Implicit Q-learning (Kostrikov et al., ICLR 2022, https://arxiv.org/abs/2110.06169): values from logged steps alone."""
+"""Implicit Q-learning (Kostrikov et al., ICLR 2022, https://arxiv.org/abs/2110.06169): values from logs alone."""
 
 from __future__ import annotations
 
@@ -53,9 +53,9 @@ class ImplicitValues(nn.Module):
     :param config: settings
     """
 
-    def __init__(self, obs_dim: int, act_dim: int, config: IQLConfig = IQLConfig()):  # noqa: B008  # frozen
+    def __init__(self, obs_dim: int, act_dim: int, config: IQLConfig | None = None):
         super().__init__()
-        self.config = config
+        self.config = config = config or IQLConfig()
         self.v = _network(obs_dim, config.hidden)
         self.q = nn.ModuleList(_network(obs_dim + act_dim, config.hidden) for _ in range(2))
         self.q_target = copy.deepcopy(self.q).requires_grad_(False)

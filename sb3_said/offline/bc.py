@@ -1,0 +1,39 @@
+"""Behaviour cloning on the augmented state."""
+
+from __future__ import annotations
+
+import numpy as np
+from torch.nn import functional as F
+
+from sb3_said.offline.learning import OfflineAlgorithm
+
+
+class BC(OfflineAlgorithm):
+    """Imitate the actions of a dataset from what is seen under delay: [observation, action history, age].
+
+    The plainest answer to a delay, and a bar for every other: the actor of ``DelayedSAC``, whose mean learns to be the
+    logged action by least squares. Its critics are not trained.
+
+    :param policy: ``"MultiInputPolicy"`` or ``"MlpPolicy"``, which name the same class
+    :param env: a task in a ``DelayedObservationWrapper``, or one with a 1-D Box observation (delay 0)
+    :param learning_rate: of the actor (CORL's BC: 3e-4)
+    :param sac_kwargs: every other argument of :class:`~sb3_said.sac.DelayedSAC`; those of its critics have no effect
+    """
+
+    def train(self, gradient_steps: int, batch_size: int = 256) -> None:
+        """Make gradient steps on batches of the replay buffer."""
+        self.policy.set_training_mode(True)
+        self._update_learning_rate([self.actor.optimizer])
+        losses = []
+        for _ in range(gradient_steps):
+            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            action = self.actor(batch.observations, deterministic=True)  # (B, act_dim), in (-1, 1)
+            loss = F.mse_loss(action, batch.actions)
+            self.actor.optimizer.zero_grad()
+            loss.backward()
+            self.actor.optimizer.step()
+            losses.append(loss.item())
+        self._n_updates += gradient_steps
+        self.policy.set_training_mode(False)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record_mean("train/action_error", float(np.mean(losses)))

@@ -1,0 +1,98 @@
+"""Learning from a replay that is already full: a gradient step takes the place of the environment step."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numpy as np
+from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.utils import configure_logger
+
+from sb3_said.offline.datasets import load_dataset
+from sb3_said.sac import DelayedSAC
+
+SelfOffline = TypeVar("SelfOffline", bound="OfflineAlgorithm")
+
+
+class OfflineAlgorithm(DelayedSAC):
+    """An SB3 algorithm that learns from logs; a subclass says in ``train`` what one gradient step is.
+
+    The environment gives the spaces and the delay, and is neither reset nor stepped.
+    """
+
+    def learn_offline(
+        self: SelfOffline,
+        dataset: Any,
+        gradient_steps: int,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 1_000,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfOffline:
+        """Learn from a dataset. ``num_timesteps`` counts gradient steps, and callbacks are called after each.
+
+        :param dataset: whatever :func:`~sb3_said.offline.load_dataset` reads
+        :param gradient_steps: to make
+        :param callback: SB3 callbacks, such as ``EvalCallback``
+        :param log_interval: gradient steps between two rows of the log; None for none
+        :param tb_log_name: name of the run in TensorBoard, the class's by default
+        :param reset_num_timesteps: count from 0
+        :param progress_bar: show one
+        :raises ValueError: as ``load_dataset`` does
+        """
+        self.take_dataset(dataset, progress_bar)
+        self.start_time = time.time_ns()
+        if reset_num_timesteps:
+            self.num_timesteps = 0
+        self._num_timesteps_at_start = self.num_timesteps
+        self._total_timesteps = total = self.num_timesteps + gradient_steps
+        if not self._custom_logger:
+            name = tb_log_name or type(self).__name__
+            self._logger = configure_logger(self.verbose, self.tensorboard_log, name, reset_num_timesteps)
+        watcher = self._init_callback(callback, progress_bar)
+        watcher.on_training_start(locals(), globals())
+        while self.num_timesteps < total:
+            self.train(1, self.batch_size)
+            self.num_timesteps += 1
+            self._update_current_progress_remaining(self.num_timesteps, total)
+            if log_interval is not None and self.num_timesteps % log_interval == 0:
+                self.logger.dump(self.num_timesteps)
+            watcher.update_locals(locals())
+            if not watcher.on_step():
+                break
+        watcher.on_training_end()
+        return self
+
+    def take_dataset(self, dataset: Any, progress_bar: bool = False) -> None:
+        """Replace the replay buffer by a dataset, whose episodes are seen at the ages that this agent's delay gives.
+
+        :param dataset: whatever :func:`~sb3_said.offline.load_dataset` reads
+        :param progress_bar: show one
+        :raises ValueError: as ``load_dataset`` does
+        """
+        spec = None if self.env is None else self.env.get_attr("spec", 0)[0]
+        env_id = None if spec is None else spec.id
+        data = load_dataset(dataset, self.observation_space, self.action_space, env_id, progress_bar)
+        self.replay_buffer = data.to_replay(
+            self.observation_space,
+            self.action_space,
+            self._draw_ages(),
+            device=self.device,
+            relabelled_ages=self.relabelled_ages,
+        )
+
+    def _draw_ages(self) -> Callable[[int], np.ndarray] | None:
+        """Return how to draw the ages of an episode, which its environment's receiver does in play."""
+        if self.env is None or not self.env.has_attr("receiver"):
+            return None
+        receiver = self.env.get_attr("receiver", 0)[0]
+        rng = np.random.default_rng(self.seed)
+
+        def draw(n_steps: int) -> np.ndarray:
+            receiver.reset(rng)
+            return np.array([0, *(receiver.step() for _ in range(n_steps))])
+
+        return draw

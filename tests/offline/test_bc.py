@@ -1,0 +1,109 @@
+"""Behaviour cloning: it learns what the delay hides as far as history tells it, and steps no environment."""
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from small_task import Drift, delayed
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_said import DelayedObservationWrapper
+from sb3_said.offline import BC, Dataset
+
+DELAY = 3
+
+
+def demonstrations(n_episodes=40, length=30, seed=0):
+    """Return episodes of s' = 0.9 s + 0.3 a + noise-free, steered by a = -0.8 s plus an exploring part that repeats."""
+    rng = np.random.default_rng(seed)
+    states, actions = np.zeros((n_episodes, length + 1, 2)), np.zeros((n_episodes, length, 1))
+    states[:, 0] = rng.normal(size=(n_episodes, 2))
+    for t in range(length):
+        actions[:, t, 0] = np.tanh(-0.8 * states[:, t, 0])
+        states[:, t + 1] = 0.9 * states[:, t] + 0.3 * actions[:, t]
+    ends = np.zeros((n_episodes, length), bool)
+    ends[:, -1] = True
+    flat = [states[:, :-1].reshape(-1, 2), actions.reshape(-1, 1), np.ones(n_episodes * length)]
+    floats = [np.asarray(x, np.float32) for x in flat]
+    return Dataset(*floats, np.zeros(ends.size, bool), ends.ravel(), states[:, -1].astype(np.float32))
+
+
+def make(env=None, **kwargs):
+    arguments = {
+        "policy_kwargs": {"net_arch": [64]},
+        "learning_rate": 3e-3,
+        "batch_size": 128,
+        "seed": 0,
+        "device": "cpu",
+    }
+    env = DelayedObservationWrapper(Drift(), DELAY) if env is None else env
+    return BC("MlpPolicy", env, buffer_size=100, **(arguments | kwargs))
+
+
+@pytest.fixture(scope="module")
+def learned():
+    model = make()
+    model.env.envs[0].step = None  # no environment is stepped, nor reset
+    model.env.envs[0].reset = None
+    return model.learn_offline(demonstrations(), 600)
+
+
+def test_it_answers_with_the_action_of_the_hidden_present(learned):
+    """The present follows from old state and history, so the error can vanish; acting on the old state keeps one."""
+    held_out = demonstrations(seed=1)
+    batch = held_out.to_replay(learned.observation_space, learned.action_space, learned._draw_ages()).sample(2_000)
+    obs = {key: batch.observations[key].numpy() for key in learned.observation_space.spaces}
+    actions = learned.predict(obs, deterministic=True)[0] / 2.0  # Drift's bounds are -2 and 2
+    error = np.mean((actions - batch.actions.numpy()) ** 2)
+    ignoring = np.mean((np.tanh(-0.8 * obs["observation"][:, :1]) - batch.actions.numpy()) ** 2)
+    assert error < 0.1 * ignoring and error < 0.01
+
+
+def test_ages_are_those_of_play(learned):
+    ages = learned.replay_buffer.ages[:, 0].reshape(-1, 30)
+    assert (ages == np.minimum(np.arange(30), DELAY)).all()
+    varying = make(delayed(delay=(0, 2)))
+    varying.take_dataset(demonstrations())
+    ages = varying.replay_buffer.ages[:, 0].reshape(-1, 30)
+    assert set(ages[:, 5]) == {0, 1, 2} and (ages[:, 0] == 0).all() and (np.diff(ages[:, 3:]) == 0).all()
+
+
+def test_it_is_saved_and_loaded(learned, tmp_path):
+    learned.save(tmp_path / "bc.zip")
+    loaded = BC.load(tmp_path / "bc.zip", device="cpu")
+    obs = learned.observation_space.sample()
+    obs["delay"][:] = 2.0
+    np.testing.assert_array_equal(
+        loaded.predict(obs, deterministic=True)[0], learned.predict(obs, deterministic=True)[0]
+    )
+    assert loaded.num_timesteps == 600
+
+
+def test_callbacks_follow_each_update_and_can_end_it():
+    class Stop(BaseCallback):
+        def _on_step(self):
+            return self.num_timesteps < 7
+
+    model = make().learn_offline(demonstrations(5), 20, callback=Stop())
+    assert model.num_timesteps == model._n_updates == 7
+    model.learn_offline(demonstrations(5), 5, reset_num_timesteps=False)
+    assert model.num_timesteps == 12
+
+
+def test_equal_seeds_learn_alike_and_a_plain_task_is_delay_0():
+    def weights():
+        model = make(Drift()).learn_offline(demonstrations(5), 5)
+        return th.cat([p.flatten() for p in model.actor.parameters()])
+
+    assert th.equal(weights(), weights())
+
+
+def test_data_of_another_task_is_refused():
+    data = demonstrations(2)
+    wrong = make(DelayedObservationWrapper(Wide(), 1))
+    with pytest.raises(ValueError, match=r"of shape \(2,\), and the task \(3,\)"):
+        wrong.learn_offline(data.to_replay(Drift.observation_space, Drift.action_space), 1)
+
+
+class Wide(Drift):
+    observation_space = spaces.Box(-1.0, 1.0, (3,), np.float32)
