@@ -91,7 +91,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
 
     def _refuse_unknown(self, sac_kwargs: dict[str, Any]) -> None:
         """:raises TypeError: for an argument that SAC does not have either, with the nearest name of all there are"""
-        for unknown in set(sac_kwargs) - set(inspect.signature(SAC).parameters):
+        for unknown in sorted(set(sac_kwargs) - set(inspect.signature(SAC).parameters)):
             names = sorted((self._argument_names() | {"device", "tensorboard_log"}) - {"policy_class"})
             nearest = get_close_matches(unknown, names, n=1)
             hint = f"did you mean {nearest[0]}?" if nearest else f"it has {', '.join(names)}."

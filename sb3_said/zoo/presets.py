@@ -26,7 +26,8 @@ def preset_overrides(
 ) -> dict[str, Any]:
     """Return what a preset changes for a task: its own entry of ``presets:`` in the file, or the preset's default.
 
-    ``cpu`` changes nothing: it is the constructors' defaults. Two keys are for planners:
+    ``cpu`` changes nothing of the file's block for the task: it is the constructors' defaults, and for tasks that end by
+    falling a ``planner_terminal_penalty``. Two keys are for planners:
     ``planner_kwargs: {base: paper, ...}`` starts from ``PlannerConfig.paper()``, and ``planner_by_delay`` holds
     settings to add, by the largest delay and under ``varies`` for delays that are not one number.
 

@@ -192,7 +192,7 @@ def test_no_action_of_broken_networks_is_returned(saved, who):
         parameter.data.fill_(np.nan)
     with model.policy.answering(who):
         for ask in (model, model.policy):
-            with pytest.raises(ValueError, match="not finite|invalid values"):
+            with pytest.raises(ValueError, match=r"not finite|invalid values"):
                 answer(ask, batch)
 
 
