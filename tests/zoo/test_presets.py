@@ -101,7 +101,7 @@ def test_the_paper_preset_merged_is_the_papers_tables(env_id: str, delay: int, t
     table: dict[str, Any] = {"d_model": 256, "sampling_steps": 20, "prediction": "epsilon", "ema_decay": 0.9999}
     table |= {"weight_factor": 2.0, "batch_size": 256, "n_candidates": 50, "horizon": 8}
     table |= {"depth": depth, "temperature": temperature}
-    # The text: states and actions z-scored, the latter after arctanh; a fixed mask; the mean value of all states; cosine
+    # The text: states z-scored, actions after an arctanh; a fixed mask; the mean value of all states; cosine
     table |= {"relative_states": False, "action_transform": "tanh", "mask": "fixed", "scored_states": "all"}
     table |= {"choice_factor": None, "lr_schedule": "cosine"}
     # The code under the results
