@@ -110,11 +110,10 @@ class WindowSource:
         numbers, sizes = th.unique(self.episodes, return_counts=True)
         order = th.randperm(len(numbers), generator=th.Generator().manual_seed(seed))
         before = sizes[order].cumsum(0) - sizes[order]  # starts of the episodes drawn earlier
-        n_drawn = int((before < wanted).sum())
-        *whole, last = numbers[order[:n_drawn]]
-        end = wanted - before[n_drawn - 1]  # steps of the last one to hold out
-        in_last = self.episodes == last
-        held = th.isin(self.episodes, th.tensor(whole)) | (in_last & (self.remaining <= end))
+        drawn = numbers[order[before < wanted]]
+        end = wanted - before[len(drawn) - 1]  # steps of the last one to hold out
+        in_last = self.episodes == drawn[-1]
+        held = th.isin(self.episodes, drawn[:-1]) | (in_last & (self.remaining <= end))
         training = self._select(~held)
         remaining = th.where(in_last[~held], training.remaining - end, training.remaining)
         return replace(training, remaining=remaining), self._select(held)

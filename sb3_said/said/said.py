@@ -218,7 +218,7 @@ class SAID(DelayedSAC):
         """Train the planner anew on the replay buffer as it is, without running the expert.
 
         Interrupting (Ctrl-C) ends the training early and keeps the planner as far as it got. Until the training ends,
-        and where it fails, the planner answers as before.
+        and where it fails, the planner answers as before. Without ``verbose`` and a bar, one line says that it begins.
 
         A row of the log is written at ``num_timesteps`` plus the updates made; with ``planner_train_freq`` at
         ``num_timesteps`` alone, since the expert's rows go on from there.
