@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_said.evaluation import Interval, bootstrap_interval
+from sb3_said.evaluation import Interval, confidence_interval
 from sb3_said.files import atomic as files
 from sb3_said.planner.precision import has_bfloat16
 
@@ -84,7 +84,7 @@ def ratio(slow: np.ndarray, fast: np.ndarray) -> Interval:
     :param slow: (rounds,) seconds
     :param fast: (rounds,) seconds of the same turns
     """
-    return bootstrap_interval(slow / fast, np.median)
+    return confidence_interval(slow / fast, np.median)
 
 
 def matmul_rate(dtype: str, device: str | th.device = "cpu", size: int | None = None, seconds: float = 1.0) -> float:

@@ -190,9 +190,10 @@ def returns_of(trial: FrozenTrial) -> list[float]:
     return [trial.intermediate_values[step] for step in sorted(trial.intermediate_values)]
 
 
-def save_plot(study: optuna.Study, path: Path) -> None:
+def save_plot(study: optuna.Study, path: Path, title: str) -> None:
     """Draw the mean return over each setting, of complete trials.
 
+    :param title: names the task and its delay
     :raises ImportError: without matplotlib
     """
     import matplotlib
@@ -203,5 +204,8 @@ def save_plot(study: optuna.Study, path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         axes = np.ravel(np.asarray(plot_slice(study, target_name="mean return")))
+    for ax in axes:
+        ax.set_title("")  # "Slice Plot"
+    axes[0].figure.suptitle(title)
     axes[0].figure.savefig(path, dpi=150, bbox_inches="tight")
     matplotlib.pyplot.close(axes[0].figure)

@@ -205,7 +205,8 @@ def report(args: argparse.Namespace, run: LoadedRun, study: Study, winner: Froze
     if find_spec("matplotlib") is None:
         print('No plot: it needs matplotlib, pip install "sb3_said[plots]"')
     else:
-        save_plot(study, folder / "slice.png")
+        title = f"{run.info['env']}, delay {run.info['delay']}: mean of {args.episodes} episodes, by setting"
+        save_plot(study, folder / "slice.png", title)
     print(f"Wrote results.json, best.yml and best.zip in {folder}\nTrain with it: {command}")
 
 

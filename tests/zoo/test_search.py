@@ -76,7 +76,7 @@ def test_a_grid_that_grew_plays_only_what_is_new(tmp_path: Path, capsys: pytest.
     assert cells(study) == [(0.0, 1), (0.0, 2), (0.0, 5), (1.0, 1), (1.0, 2), (1.0, 5)]
     winner = find_winner(study)  # of equals, the coldest
     assert winner is not None and winner.params == {"depth": 2, "temperature": 0.0, "sampling_steps": 2}
-    save_plot(study, tmp_path / "slice.png")
+    save_plot(study, tmp_path / "slice.png", "a task, a delay")
     assert (tmp_path / "slice.png").read_bytes()[:4] == b"\x89PNG"
 
 
