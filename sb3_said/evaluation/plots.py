@@ -141,7 +141,7 @@ def plot_over_delays(table: Mapping[str, Mapping[int | str, npt.ArrayLike]], tit
     kinds: list[Sequence[int | str]] = [kind for kind in (fixed, random) if kind]
     if not kinds:
         raise ValueError(f"Nothing was played, got {table}; give each agent returns under some delay.")
-    legend_rows = math.ceil(len(table) / len(kinds))
+    legend_rows = math.ceil(len(table) / 2)
     axes = panels(len(kinds), title, width=max(5.0, 1.3 * len(random)), height=3.4 + 0.2 * legend_rows)
     for ax, kind in zip(axes, kinds, strict=True):
         for i, (color, (agent, row)) in enumerate(zip(colors(len(table)), table.items(), strict=True)):
@@ -166,7 +166,7 @@ def plot_over_delays(table: Mapping[str, Mapping[int | str, npt.ArrayLike]], tit
     axes[0].autoscale_view()  # sharing alone leaves the limits of the first
     axes[0].set_ylabel("return of an episode (undiscounted)")
     handles, labels = axes[0].get_legend_handles_labels()
-    axes[0].figure.legend(handles, labels, loc="outside upper center", ncols=len(kinds), frameon=False)
+    axes[0].figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
     return axes
 
 
