@@ -112,7 +112,8 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
         if set(observation_space.keys()) not in (set(KEYS), {*KEYS, *STATE_KEYS}):
             raise ValueError(
                 f"Expected the dict observation of DelayedObservationWrapper ({', '.join(KEYS)}), "
-                f"got the keys {sorted(observation_space.keys())}; wrap the task in it."
+                f"got the keys {sorted(observation_space.keys())}; wrap the task in "
+                "gymnasium.wrappers.FlattenObservation where it has a dict of its own, and then in this."
             )
         state_space = observation_space["observation"]
         max_delay = observation_space["action_history"].shape[0]  # type: ignore[index]  # a Box has a shape
