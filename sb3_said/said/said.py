@@ -258,13 +258,6 @@ class SAID(DelayedSAC):
             if {key: state[key] for key in data} == data:
                 trainer.load_state_dict(state["trainer"])
 
-        # A logger of its own, to the same places: what the user's holds for its next row is not the planner's
-        log = Logger(self.logger.dir, self.logger.output_formats)
-        log.set_level(self.logger.level)
-
-        def row(trainer: PlannerTrainer) -> int:
-            return self.num_timesteps + (trainer.n_updates if self.planner_train_freq is None else 0)
-
         def on_update(trainer: PlannerTrainer) -> None:
             bar.update()
             done = trainer.n_updates
@@ -273,9 +266,7 @@ class SAID(DelayedSAC):
                 losses = trainer.pop_losses()
                 bar.set_postfix(loss=losses["planner/loss"])
                 errors = trainer.evaluate() if done % eval_interval == 0 or is_end else {}
-                for key, value in {**losses, **errors, "planner/n_updates": done}.items():
-                    log.record(key, value)
-                log.dump(row(trainer))
+                self._log_planner({**losses, **errors, "planner/n_updates": done}, done)
                 if is_end and (worse := worse_than_regression(errors)):
                     warnings.warn(
                         f"On held-out windows the planner is still worse than a small regression: {worse}. It is "
@@ -300,10 +291,20 @@ class SAID(DelayedSAC):
                 trial_episodes = 0
         if trainer.n_updates > 0:
             self.policy.planner_updates.fill_(float(trainer.n_updates))
-            self.set_answer("planner")
-            n_episodes = self.planner_trial_episodes if trial_episodes is None else trial_episodes
-            if n_episodes > 0 and self.env is not None:
-                for key, value in let_the_better_answer(self, n_episodes, progress_bar).items():
-                    log.record(key, value)
-                log.dump(row(trainer))
+            self._settle_answer(self.planner_trial_episodes if trial_episodes is None else trial_episodes, progress_bar)
         self._planner_trained_at = self.num_timesteps
+
+    def _settle_answer(self, n_episodes: int, progress_bar: bool) -> None:
+        """Let the newly trained planner answer, or whoever is better in a trial."""
+        self.set_answer("planner")
+        if n_episodes > 0 and self.env is not None:
+            returns = let_the_better_answer(self, n_episodes, progress_bar)
+            self._log_planner(returns, int(self.policy.planner_updates))
+
+    def _log_planner(self, values: dict[str, float], n_updates: int) -> None:
+        """Write a row with a logger of its own, to the same places: the user's keeps what it holds for its next row."""
+        log = Logger(self.logger.dir, self.logger.output_formats)
+        log.set_level(self.logger.level)
+        for key, value in values.items():
+            log.record(key, value)
+        log.dump(self.num_timesteps + (n_updates if self.planner_train_freq is None else 0))
