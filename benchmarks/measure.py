@@ -13,11 +13,13 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from tqdm import tqdm
 
-from sb3_said.evaluation import Interval, bootstrap_interval
+from sb3_said.evaluation import Interval, confidence_interval
 from sb3_said.files import atomic as files
 from sb3_said.planner.precision import has_bfloat16
 
+PATIENCE = 2.0  # seconds without a sign of life
 DTYPES = {"float32": th.float32, "bfloat16": th.bfloat16}
 
 
@@ -52,7 +54,7 @@ def turn_by_turn(
 ) -> dict[str, np.ndarray]:
     """Time variants in turn, in both orders alternately, so that a drift of the machine meets all of them alike.
 
-    Every variant runs once before, uncounted.
+    Every variant runs once before, uncounted. What takes longer than ``PATIENCE`` shows on stderr how far it is.
 
     :param variants: what to time, by name
     :param rounds: turns of each
@@ -68,7 +70,7 @@ def turn_by_turn(
     seconds = {name: np.empty(rounds) for name in names}
     for name in names:
         variants[name]()
-    for turn in range(rounds):
+    for turn in tqdm(range(rounds), unit="turn", leave=False, delay=PATIENCE, mininterval=1.0):
         for name in names if turn % 2 == 0 else names[::-1]:
             wait()
             began = time.perf_counter()
@@ -84,7 +86,7 @@ def ratio(slow: np.ndarray, fast: np.ndarray) -> Interval:
     :param slow: (rounds,) seconds
     :param fast: (rounds,) seconds of the same turns
     """
-    return bootstrap_interval(slow / fast, np.median)
+    return confidence_interval(slow / fast, np.median)
 
 
 def matmul_rate(dtype: str, device: str | th.device = "cpu", size: int | None = None, seconds: float = 1.0) -> float:

@@ -1,4 +1,4 @@
-"""The delayed world, NumPy only: delay processes, receivers, the observation wrapper, and the delay of a log."""
+"""The delayed world, NumPy only: delay processes, receivers, the wrapper, the scale of actions, the delay of a log."""
 
 from sb3_said.delays.combined import DroppedPackets, HeldDelay, PeriodicPackets, TotalDelay
 from sb3_said.delays.estimation import DelayEstimate, estimate_delay
@@ -12,6 +12,7 @@ from sb3_said.delays.processes import (
     UniformDelay,
     in_steps,
 )
+from sb3_said.delays.space import scale_action, unscale_action
 from sb3_said.delays.wrapper import DelayedObservationWrapper
 
 __all__ = [
@@ -30,4 +31,6 @@ __all__ = [
     "UniformDelay",
     "estimate_delay",
     "in_steps",
+    "scale_action",
+    "unscale_action",
 ]

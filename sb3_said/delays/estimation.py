@@ -11,6 +11,7 @@ N_FOLDS = 5  # of the held-out predictions
 MAX_BLOCKS = 100  # a block is a run of rows; it is held out and resampled as a whole
 ROWS_PER_FEATURE = 4  # with fewer, held-out predictions are noise
 MIN_ROWS = 50  # fewer make too few blocks to resample: unrelated data could look certain
+LEAST_SCORE = 2e-3  # where actions follow from the observations, what the ridge leaves of them explains less
 ROUNDING = 1e-8  # a channel stands still if it moves by less than this part of its size
 
 
@@ -19,7 +20,8 @@ class DelayEstimate:
     """What ``estimate_delay`` found.
 
     :param delay: the age with the highest score, in control steps; the most frequent age where it varies
-    :param confidence: fraction of resampled logs in which the same age has the highest score, and one above 0
+    :param confidence: fraction of resampled logs in which the same age has the highest score, and one above 0.002: an
+        age whose action explains nothing is no finding, however often it comes first
     :param scores: (max_delay + 1,), a score for each age: the part of the held-out change from one observation to the
         next that the action of that age explains, beyond what earlier observations explain. It is at most 1, and about
         0 or below for an age that does not occur. Where the delay varies, it is about in proportion to how often each
@@ -46,7 +48,8 @@ def estimate_delay(
     of the residual of the change (by the rise of R^2, on held-out blocks), and its age is the delay. A channel that
     echoes the command counts like any other. Rows without a new observation are left out.
 
-    The observations must not determine the actions: log random actions, noise, or a task that keeps moving. Observation
+    The observations must not determine the actions, as they do in a log of a policy without noise, whose scores are all
+    near 0: log random actions, noise, or a task that keeps moving. Observation
     and action delay cannot be told apart, so their sum is found. An age equal to ``max_delay`` may stand for a larger
     one: ask again with a larger ``max_delay``.
 
@@ -92,7 +95,8 @@ def estimate_delay(
     n_blocks = len(of_blocks)
     draws = np.random.default_rng(seed).multinomial(n_blocks, np.full(n_blocks, 1 / n_blocks), n_resamples)
     resampled = draws @ of_blocks  # (n_resamples, max_delay + 1)
-    same = (resampled.argmax(1) == best) & (resampled.max(1) > 0)
+    n_rows_drawn = draws @ np.bincount(block)  # (n_resamples,)
+    same = (resampled.argmax(1) == best) & (resampled.max(1) > LEAST_SCORE * n_rows_drawn)
     return DelayEstimate(best, float(same.mean()), scores)
 
 

@@ -21,15 +21,20 @@ def check_task(observation_space: spaces.Space[Any], action_space: spaces.Space[
 
     :raises ValueError: unless observations are a 1-D Box, and actions a 1-D Box with finite bounds that differ
     """
-    if not (isinstance(observation_space, spaces.Box) and len(observation_space.shape) == 1):
+    if isinstance(observation_space, spaces.Dict) and set(KEYS) <= set(observation_space.keys()):
         raise ValueError(
-            f"Expected a 1-D Box observation, got {observation_space}; wrap the task in "
-            "gymnasium.wrappers.FlattenObservation first."
+            "The task is in a DelayedObservationWrapper already, and expected is a task with a 1-D Box observation; "
+            "use one wrapper with the sum of the delays, or with delay and action_delay."
         )
+    if not (isinstance(observation_space, spaces.Box) and len(observation_space.shape) == 1):
+        flat = "wrap the task in gymnasium.wrappers.FlattenObservation first"
+        advice = flat if observation_space.is_np_flattenable else "give the task one, of a fixed length"
+        raise ValueError(f"Expected a 1-D Box observation, got {observation_space}; {advice}.")
     if not (isinstance(action_space, spaces.Box) and len(action_space.shape) == 1 and action_space.is_bounded()):
+        box = "use gymnasium.wrappers.TransformAction(env, function, action_space) to give the task such actions"
+        advice = box if isinstance(action_space, spaces.Box) else "other actions than continuous ones are not supported"
         raise ValueError(
-            f"Expected a 1-D Box action with finite bounds, got {action_space}; actions are continuous here and "
-            "scaled by their bounds, so give the task such an action space."
+            f"Expected a 1-D Box action with finite bounds, by which it is scaled, got {action_space}; {advice}."
         )
     if not np.all(action_space.low < action_space.high):
         raise ValueError(
@@ -37,6 +42,38 @@ def check_task(observation_space: spaces.Space[Any], action_space: spaces.Space[
             "entries that cannot vary."
         )
     return observation_space, action_space
+
+
+def scale_action(action: np.ndarray, action_space: spaces.Box) -> np.ndarray:
+    """Scale actions to [-1, 1], the units of an action history; bit for bit the same where the bounds are -1 and 1.
+
+    :param action: (..., act_dim), in the units of the action space; clipped to its bounds
+    :param action_space: (act_dim,), with finite bounds
+    :return: (..., act_dim) float64
+
+    >>> scale_action(np.array([0.5]), spaces.Box(-2.0, 2.0, (1,)))
+    array([0.25])
+    """
+    center, half = _center_and_half(action_space)
+    return np.clip((action - center) / half, -1.0, 1.0)
+
+
+def unscale_action(scaled_action: np.ndarray, action_space: spaces.Box) -> np.ndarray:
+    """Return actions in the units of the action space: the inverse of :func:`scale_action`.
+
+    :param scaled_action: (..., act_dim), clipped to [-1, 1]
+    :param action_space: (act_dim,), with finite bounds
+    :return: (..., act_dim), of the action space's type
+    """
+    center, half = _center_and_half(action_space)
+    action = (center + half * np.clip(scaled_action, -1.0, 1.0)).astype(action_space.dtype)
+    return np.clip(action, action_space.low, action_space.high)
+
+
+def _center_and_half(space: spaces.Box) -> tuple[np.ndarray, np.ndarray]:
+    """Return the middle of the bounds and half their distance, (act_dim,) float64 each."""
+    low, high = 0.5 * space.low.astype(np.float64), 0.5 * space.high.astype(np.float64)
+    return low + high, high - low  # halved first: their own type may not hold the distance
 
 
 def delayed_space(
@@ -75,7 +112,8 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
         if set(observation_space.keys()) not in (set(KEYS), {*KEYS, *STATE_KEYS}):
             raise ValueError(
                 f"Expected the dict observation of DelayedObservationWrapper ({', '.join(KEYS)}), "
-                f"got the keys {sorted(observation_space.keys())}; wrap the task in it."
+                f"got the keys {sorted(observation_space.keys())}; wrap the task in "
+                "gymnasium.wrappers.FlattenObservation where it has a dict of its own, and then in this."
             )
         state_space = observation_space["observation"]
         max_delay = observation_space["action_history"].shape[0]  # type: ignore[index]  # a Box has a shape

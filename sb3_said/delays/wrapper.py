@@ -10,7 +10,7 @@ import numpy as np
 from sb3_said.delays.combined import TotalDelay
 from sb3_said.delays.processes import Delay, as_process, checked_count
 from sb3_said.delays.receivers import RECEIVERS, Actuator
-from sb3_said.delays.space import EXECUTED, UNDELAYED, check_task, delayed_space
+from sb3_said.delays.space import EXECUTED, UNDELAYED, check_task, delayed_space, scale_action
 from sb3_said.delays.text import age_range, make_process
 
 #: Keeps the delays' random numbers apart from those that the task draws from the same seed.
@@ -115,9 +115,7 @@ class DelayedObservationWrapper(
             self.actuator = Actuator(RECEIVERS[receiver](as_process(self.process.action)), observed.max_delay)
         self.receiver = RECEIVERS[receiver](observed)
 
-        self._action_low = act_space.low.astype(np.float64)  # whose span the bounds' own type may not hold
-        self._action_span = act_space.high.astype(np.float64) - self._action_low
-        self._action_is_scaled = bool(np.all(act_space.low == -1) and np.all(act_space.high == 1))
+        self._task_action_space = act_space
         self.state_history = state_history
         space = delayed_space(obs_space, act_space, self.max_delay, state_history)
         self.observation_space = space  # type: ignore[assignment]  # a Dict is a Space[dict[str, Any]]
@@ -159,7 +157,7 @@ class DelayedObservationWrapper(
         state: Any
         executed = action if self.actuator is None else self.actuator.execute(action)
         state, reward, terminated, truncated, info = self.env.step(executed)
-        _append(self._actions, self._scale(action))
+        _append(self._actions, scale_action(action, self._task_action_space))
         age = self.receiver.step()
         lag, shown = (0, None) if self.actuator is None else (self.actuator.lag(age), executed)
         return self._observe(state, age, lag), reward, terminated, truncated, self._with_own(info, shown)
@@ -186,14 +184,8 @@ class DelayedObservationWrapper(
             **{key: value for key, value in info.items() if key != EXECUTED},
             UNDELAYED: self._states[-1].copy(),
             "forced_deliveries": sum(receiver.forced_deliveries for receiver in receivers),
-            **({} if executed is None else {EXECUTED: self._scale(executed)}),
+            **({} if executed is None else {EXECUTED: scale_action(executed, self._task_action_space)}),
         }
-
-    def _scale(self, action: np.ndarray) -> np.ndarray:
-        """Scale from the action space to [-1, 1]; bit for bit the same where it has these bounds already."""
-        if not self._action_is_scaled:
-            action = 2.0 * ((action - self._action_low) / self._action_span) - 1.0
-        return np.clip(action, -1.0, 1.0)
 
 
 def _append(rows: np.ndarray, row: np.ndarray | float) -> None:

@@ -12,23 +12,25 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+import numpy.typing as npt
 
-from sb3_said.evaluation.statistics import Interval, Summary, bootstrap_interval
+from sb3_said.evaluation.statistics import Interval, Summary, confidence_interval
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Okabe and Ito's palette: told apart by colour-blind readers too.
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-N_DELAYS_PLOTTED = 5  # where a planner logged the errors of more delays than there are colours
-MARKERS = "osD^vPX"  # one more than colours, so that many agents differ in one or the other
+# Okabe and Ito's palette without its yellow: told apart by colour-blind readers too.
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+N_DELAYS_PLOTTED = 5  # where a planner logged the errors of more delays than can be told apart
+MARKERS = "osD^vPX*"
 UPDATES = "planner/n_updates"  # column of progress.csv
 
 
-def panels(n: int = 1, width: float = 5.0, height: float = 3.6) -> list[Axes]:
+def panels(n: int = 1, title: str = "", width: float = 5.0, height: float = 3.6) -> list[Axes]:
     """Make a figure of n panels, up to three side by side, more in two rows.
 
     :param n: panels
+    :param title: of the figure: name the task and its delay
     :param width: of each panel, inches
     :param height: of each panel, inches
     :raises ImportError: without matplotlib
@@ -40,12 +42,28 @@ def panels(n: int = 1, width: float = 5.0, height: float = 3.6) -> list[Axes]:
     rows = 1 if n <= 3 else 2
     columns = math.ceil(n / rows)
     figure = Figure(figsize=(columns * width, rows * height), dpi=150, layout="constrained")
+    if title:
+        figure.suptitle(title)
     axes = [figure.add_subplot(rows, columns, i + 1) for i in range(n)]
     for ax in axes:
         ax.spines[["top", "right"]].set_visible(False)
         ax.grid(axis="y", alpha=0.3)
         ax.set_axisbelow(True)
     return axes
+
+
+def colors(n: int, ordered: bool = False) -> list[str]:
+    """Return n colours, no two alike.
+
+    :param n: lines to draw
+    :param ordered: from dark to light, for lines of a growing number
+    """
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    if n <= len(COLORS) and not ordered:
+        return list(COLORS[:n])
+    return [to_hex(color) for color in colormaps["viridis" if ordered else "turbo"](np.linspace(0, 0.9, n))]
 
 
 def save(ax: Axes, path: str | Path) -> None:
@@ -56,6 +74,8 @@ def save(ax: Axes, path: str | Path) -> None:
 
 def plot_learning_curve(run: str | Path, ax: Axes | None = None, window: int = 20) -> Axes:
     """Plot the returns of training, and of the evaluations beside it, over environment steps.
+
+    Its colours are none of a planner's and an expert's in :func:`plot_returns`, so that both fit into one figure.
 
     :param run: folder with ``*.monitor.csv`` (SB3's Monitor), ``evaluations.npz`` (SB3's EvalCallback), or both
     :param ax: to draw on; a new figure by default
@@ -71,14 +91,14 @@ def plot_learning_curve(run: str | Path, ax: Axes | None = None, window: int = 2
     if len(steps):
         window = min(window, len(returns))
         mean = np.convolve(returns, np.full(window, 1 / window), mode="valid")
-        ax.plot(steps, returns, ".", color=COLORS[0], alpha=0.2, markersize=3, markeredgewidth=0)
-        ax.plot(steps[window - 1 :], mean, color=COLORS[0], label=f"training, mean of {window} episodes")
+        ax.plot(steps, returns, ".", color=COLORS[2], alpha=0.2, markersize=3, markeredgewidth=0)
+        ax.plot(steps[window - 1 :], mean, color=COLORS[2], label=f"training, mean of {window} episodes")
     if evaluations.is_file():
         with np.load(evaluations) as file:
             eval_steps, results = file["timesteps"], file["results"]
-        value, low, high = _bounds([bootstrap_interval(row) for row in results])
-        ax.plot(eval_steps, value, color=COLORS[1], marker="o", markersize=3, label="evaluation")
-        ax.fill_between(eval_steps, low, high, color=COLORS[1], alpha=0.2, linewidth=0)
+        value, low, high = _bounds([confidence_interval(row) for row in results])
+        ax.plot(eval_steps, value, color=COLORS[3], marker="o", markersize=3, label="evaluation, 95 % interval")
+        ax.fill_between(eval_steps, low, high, color=COLORS[3], alpha=0.2, linewidth=0)
     ax.set_xlabel("environment steps")
     ax.set_ylabel("return of an episode (undiscounted)")
     ax.legend(frameon=False)
@@ -92,8 +112,7 @@ def plot_returns(summaries: Sequence[Summary], ax: Axes | None = None) -> Axes:
     :param ax: to draw on; a new figure by default
     """
     ax = panels(width=1.6 + 1.4 * len(summaries))[0] if ax is None else ax
-    for column, summary in enumerate(summaries):
-        color = COLORS[column % len(COLORS)]
+    for column, (summary, color) in enumerate(zip(summaries, colors(len(summaries)), strict=True)):
         n = len(summary.returns)
         # Spread evenly, not at random, so that the same evaluation draws the same picture.
         x = column + np.linspace(-0.25, 0.25, n) if n > 1 else [column]
@@ -107,28 +126,29 @@ def plot_returns(summaries: Sequence[Summary], ax: Axes | None = None) -> Axes:
     return ax
 
 
-def plot_over_delays(table: Mapping[str, Mapping[int | str, Summary]]) -> list[Axes]:
+def plot_over_delays(table: Mapping[str, Mapping[int | str, npt.ArrayLike]], title: str = "") -> list[Axes]:
     """Plot mean returns with their intervals: a line over fixed delays, and points for each random delay.
 
-    :param table: for each agent its summaries, by the delay in control steps or, for a random one, by its name; what an
-        agent lacks is left out
+    :param table: for each agent its returns, by the delay in control steps or, for a random one, by its name; each
+        (n_episodes,), or (n_seeds, n_episodes) of several training seeds. What an agent lacks is left out
+    :param title: of the figure: name the task
     :return: a panel for each kind of delay there is, on one figure, with the same axis of returns
-    :raises ValueError: for a table without a summary
+    :raises ValueError: for a table without returns
     """
     delays = list(dict.fromkeys(delay for row in table.values() for delay in row))
     fixed = sorted(delay for delay in delays if isinstance(delay, int))
     random = [delay for delay in delays if isinstance(delay, str)]
     kinds: list[Sequence[int | str]] = [kind for kind in (fixed, random) if kind]
     if not kinds:
-        raise ValueError(f"Nothing was played, got {table}; give each agent a summary for some delay.")
-    legend_rows = math.ceil(len(table) / len(kinds))
-    axes = panels(len(kinds), width=max(5.0, 1.3 * len(random)), height=3.4 + 0.2 * legend_rows)
+        raise ValueError(f"Nothing was played, got {table}; give each agent returns under some delay.")
+    legend_rows = math.ceil(len(table) / 2)
+    axes = panels(len(kinds), title, width=max(5.0, 1.3 * len(random)), height=3.4 + 0.2 * legend_rows)
     for ax, kind in zip(axes, kinds, strict=True):
-        for i, (agent, row) in enumerate(table.items()):
-            color, played = COLORS[i % len(COLORS)], [delay for delay in kind if delay in row]
+        for i, (color, (agent, row)) in enumerate(zip(colors(len(table)), table.items(), strict=True)):
+            played = [delay for delay in kind if delay in row]
             offset = 0.7 * ((i + 0.5) / len(table) - 0.5)  # agents side by side at the tick of a random delay
             x = played if kind is fixed else [kind.index(delay) + offset for delay in played]
-            value, low, high = _bounds([row[delay].mean_return for delay in played])
+            value, low, high = _bounds([confidence_interval(row[delay]) for delay in played])
             ax.errorbar(
                 x, value, yerr=[value - low, high - value], color=color, marker=MARKERS[i % len(MARKERS)],
                 markersize=5, elinewidth=1, capsize=2, linestyle="-" if kind is fixed else "none", label=agent,
@@ -146,16 +166,16 @@ def plot_over_delays(table: Mapping[str, Mapping[int | str, Summary]]) -> list[A
     axes[0].autoscale_view()  # sharing alone leaves the limits of the first
     axes[0].set_ylabel("return of an episode (undiscounted)")
     handles, labels = axes[0].get_legend_handles_labels()
-    axes[0].figure.legend(handles, labels, loc="outside upper center", ncols=len(kinds), frameon=False)
+    axes[0].figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
     return axes
 
 
 def plot_planner_errors(run: str | Path, kind: Literal["present", "action"], ax: Axes | None = None) -> Axes:
     """Plot how far the planner is off on held-out windows, beside an MLP regression trained on the same windows.
 
-    One colour for each delay d, for five of them where there are many; solid lines are the planner's
-    ``planner/{kind}_error_d*``, dashed ones the MLP's ``planner/{kind}_error_mlp_d*``. A planner above its dashed line
-    is not trained yet.
+    One colour for each delay d, the darker the shorter, for five of them where there are many. Solid lines are the
+    planner's ``planner/{kind}_error_d*``, dashed ones the MLP's ``planner/{kind}_error_mlp_d*``. A planner above its
+    dashed line is not trained yet.
 
     :param run: folder with SB3's ``progress.csv``, and ``progress_STEPS.csv`` where the training was resumed
     :param kind: "present", the error of the decoded present state in standard deviations of the states; or "action",
@@ -177,18 +197,19 @@ def plot_planner_errors(run: str | Path, kind: Literal["present", "action"], ax:
     ax = panels()[0] if ax is None else ax
     # Over both kinds, so that a delay has the same colour in both plots.
     delays = sorted({int(d) for name in names for d in re.findall(r"planner/\w+_error(?:_mlp)?_d(\d+)", name)})
-    if len(delays) > len(COLORS):  # the shortest, the longest, and some between
+    if len(delays) > N_DELAYS_PLOTTED + 1:  # the shortest, the longest, and some between
         delays = [delays[round(k)] for k in np.linspace(0, len(delays) - 1, N_DELAYS_PLOTTED)]
         columns = {name: match for name, match in columns.items() if int(match[2]) in delays}
+    color_of = dict(zip(delays, colors(len(delays), ordered=True), strict=True))
     updates = _running_total([float(row.get(UPDATES) or 0.0) for row in rows])
     for column, match in sorted(columns.items(), key=lambda item: (int(item[1][2]), item[0])):
         points = [(x, float(row[column])) for x, row in zip(updates, rows, strict=True) if row.get(column)]
         ax.plot(
             *zip(*points, strict=True),
-            color=COLORS[delays.index(int(match[2]))],
+            color=color_of[int(match[2])],
             linestyle="--" if match[1] else "-",
             marker=".",
-            label=f"{'MLP' if match[1] else 'planner'}, d = {match[2]}",
+            label=f"{'MLP' if match[1] else 'planner'}, delay {match[2]}",
         )
     ax.set_xlabel("planner updates")
     unit = {"present": "standard deviations", "action": "environment units"}[kind]

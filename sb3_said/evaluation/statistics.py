@@ -11,13 +11,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from scipy.stats import DegenerateDataWarning, bootstrap, trim_mean
+from scipy.stats import t as t_distribution
+
+# With fewer units a bootstrap interval covers less than Student's t, of normal and of skewed values alike.
+FEWEST_RESAMPLED = 10
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A statistic of a sample and its bootstrap interval.
+    """A statistic of n independent units and its interval, see ``confidence_interval``.
 
-    ``low`` and ``high`` are NaN for a single value, which tells nothing about the spread.
+    ``low`` and ``high`` are NaN for a single unit, which tells nothing about the spread.
     """
 
     value: float
@@ -25,6 +29,7 @@ class Interval:
     high: float
     confidence: float
     n: int
+    method: str
 
     def __str__(self) -> str:
         return f"{self.value:.1f} [{self.low:.1f}, {self.high:.1f}]"
@@ -81,8 +86,8 @@ class Summary:
         """
         return cls(
             label=label,
-            mean_return=bootstrap_interval(returns),
-            mean_length=bootstrap_interval(lengths),
+            mean_return=confidence_interval(returns),
+            mean_length=confidence_interval(lengths),
             latency=latency,
             returns=[float(x) for x in np.asarray(returns)],
             lengths=[int(x) for x in np.asarray(lengths)],
@@ -102,43 +107,64 @@ def iqm(values: np.ndarray, axis: int = -1) -> np.ndarray:
     return np.asarray(trim_mean(values, 0.25, axis=axis))
 
 
-def bootstrap_interval(
+def confidence_interval(
     values: npt.ArrayLike,
     statistic: Callable[..., Any] = np.mean,
     confidence: float = 0.95,
     n_resamples: int = 10_000,
     seed: int = 0,
 ) -> Interval:
-    """Bias-corrected and accelerated (BCa) bootstrap interval of a statistic, by SciPy.
+    """Interval of a statistic of independent units: episodes of one agent, or training seeds with their episodes.
 
-    Returns of control tasks are skewed: a few episodes fall far below many good ones. BCa corrects for that, and the
-    plain percentile interval does not. It is undefined where leaving out any one value changes nothing, as in the
-    median of 1, 1, 1, 1, 5; the percentile interval stands in there.
+    Values of one unit share its luck. So they are left out or drawn together, and their own spread counts as part of
+    the units'. The interval's ``method`` says how it was made:
 
-    :param values: (n,), independent: one per episode of one agent, or one per training seed
-    :param statistic: of (..., n) along ``axis=-1``, such as ``np.mean`` or ``iqm``
+    - ``"Student's t"``, below 10 units: value +- t_{n-1} times the jackknife's standard error, which leaves out one
+      unit at a time (Efron and Stein 1981). For the mean it is the usual t interval of the units' means. Of three to
+      five normal units a bootstrap interval that is called 95 % covers 73 to 83 %, and jumps from one resample to the
+      next as values change by nothing.
+    - ``"BCa bootstrap"``, from 10 units on, by SciPy. Returns of control tasks are skewed: a few episodes fall far
+      below many good ones. BCa corrects for that, and the other two do not.
+    - ``"percentile bootstrap"`` where BCa is undefined, because leaving out any one unit changes nothing.
+
+    :param values: (n,), one for each unit; or (n_seeds, n_episodes), whose rows are the units
+    :param statistic: of (..., k) along ``axis=-1``, such as ``np.mean`` or ``iqm``; of all values of all units
     :param confidence: probability that the interval is to cover, in (0, 1)
     :param n_resamples: bootstrap samples
     :param seed: of the resampling; fixed, so that the same episodes give the same interval
     :raises ValueError: for no values, values that are not finite, or a confidence outside (0, 1)
     """
-    sample = np.asarray(values, dtype=np.float64).ravel()
-    n = len(sample)
-    if n == 0 or not np.all(np.isfinite(sample)):
-        raise ValueError(f"An interval needs at least one value and only finite ones, got {sample}.")
+    units = np.asarray(values, dtype=np.float64)
+    units = units.reshape(len(units), -1) if units.size else units  # (n, k)
+    n = len(units)
+    if units.size == 0 or not np.all(np.isfinite(units)):
+        raise ValueError(f"An interval needs at least one value and only finite ones, got {units}.")
     if not 0 < confidence < 1:
         raise ValueError(f"confidence is a probability strictly between 0 and 1, got {confidence}.")
-    value = float(statistic(sample, axis=-1))
+
+    def of_units(rows: np.ndarray, axis: int = -1) -> Any:
+        """Return the statistic of the values of units, whose numbers are on the last axis: (..., m) -> (...)."""
+        return statistic(units[rows.astype(np.intp)].reshape(*rows.shape[:-1], -1), axis=-1)
+
+    everyone = np.arange(n)
+    value = float(of_units(everyone))
     if n == 1:
-        return Interval(value, math.nan, math.nan, confidence, n)
-    settings = {"statistic": statistic, "confidence_level": confidence, "vectorized": True}
+        return Interval(value, math.nan, math.nan, confidence, n, "none")
+    if n < FEWEST_RESAMPLED:
+        without_one = of_units(np.stack([np.delete(everyone, i) for i in everyone]))  # (n,)
+        error = math.sqrt((n - 1) * np.var(without_one))
+        half = float(t_distribution.ppf((1 + confidence) / 2, n - 1)) * error
+        return Interval(value, value - half, value + half, confidence, n, "Student's t")
+    method = "BCa bootstrap"
+    settings = {"statistic": of_units, "confidence_level": confidence, "vectorized": True}
     with warnings.catch_warnings(), np.errstate(divide="ignore", invalid="ignore"):
         warnings.simplefilter("ignore", DegenerateDataWarning)
-        found = bootstrap((sample,), n_resamples=n_resamples, rng=np.random.default_rng(seed), **settings)
+        found = bootstrap((everyone,), n_resamples=n_resamples, rng=np.random.default_rng(seed), **settings)
     if not np.all(np.isfinite(found.confidence_interval)):
-        found = bootstrap((sample,), n_resamples=0, method="percentile", bootstrap_result=found, **settings)
+        method = "percentile bootstrap"
+        found = bootstrap((everyone,), n_resamples=0, method="percentile", bootstrap_result=found, **settings)
     low, high = found.confidence_interval
-    return Interval(value, float(low), float(high), confidence, n)
+    return Interval(value, float(low), float(high), confidence, n, method)
 
 
 def _without_nan(value: Any) -> Any:

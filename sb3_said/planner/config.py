@@ -69,7 +69,8 @@ class PlannerConfig:
     ema_warmup: bool = True  # without it 37 % of the initial weights remain after 10,000 steps
     weight_factor: float = 2.0  # paper: beta in the window weight exp(beta * (value - 1))
     # What that value is: "rank", the part of all windows that are worth less, so that beta picks as much of any data
-    # (measured, results/settings.md), or "range", between the lowest and the highest value of the data (paper)
+    # (measured, results/settings.md); "centred", from -1 at the lowest value of the data to 1 at the highest (DV; the
+    # paper does not say); or "range", the same from 0 to 1
     value_scale: str = "rank"
     precision: str = "auto"  # bfloat16 autocast where the hardware has it; or "float32", "bfloat16"
 
@@ -116,7 +117,9 @@ class PlannerConfig:
 
     @classmethod
     def paper(cls, depth: int = 8, temperature: float = 0.6, **changes: object) -> PlannerConfig:
-        """Return the paper's settings; depth and temperature are the two it tunes per task.
+        """Return the settings of the paper's Table 3, and of its Table 4 depth and temperature, tuned per task.
+
+        What neither the tables nor the text state is as in DV. ``docs/design.md`` has what differs all the same.
 
         :param changes: other fields to set
         """
@@ -141,7 +144,7 @@ class PlannerConfig:
             batch_size=256,
             gradient_clip=None,
             ema_warmup=False,
-            value_scale="range",
+            value_scale="centred",
             precision="float32",
         )
         return replace(config, **changes)  # type: ignore[arg-type]

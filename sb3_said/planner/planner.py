@@ -118,7 +118,7 @@ class InpaintingPlanner(nn.Module):
         weight: th.Tensor | None = None,
         generator: th.Generator | None = None,
     ) -> th.Tensor:
-        """Return the weighted mean squared error over unknown entries of valid steps (the paper's Algorithm 1).
+        """Return the weighted mean squared error over unknown entries of valid steps (paper, Appendix B.4).
 
         The decision index counts ``config.decision_weight`` times as much as the others. A window of delay d has
         d + ``config.horizon`` steps; the rest is ignored.
@@ -252,7 +252,10 @@ class InpaintingPlanner(nn.Module):
         else:
             plan = self._inpaint(steps, value_fn, shortest, longest > shortest, *inputs)
         if plan.values.isnan().any():
-            raise ValueError("value_fn returned NaN, so that no candidate is the best; check the critic.")
+            raise ValueError(
+                "value_fn returned NaN, so that no candidate is the best; check the critic, and the observations, the "
+                f"largest of which is {observation.abs().max():.3g}."
+            )
         return plan
 
     def _can_be_recorded(self, value_fn: ValueFn | None) -> bool:

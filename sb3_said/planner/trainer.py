@@ -61,18 +61,19 @@ def worse_than_regression(errors: dict[str, float], tolerance: float = 0.05) -> 
 class PlannerTrainer:
     """Train a planner on windows of states and actions.
 
-    Gradient steps move the trainer's own weights (``online``). After every update the planner handed in holds their
-    exponential moving average, ready to be used, saved and evaluated. A small regression learns from the same batches,
-    as the bar for the planner's errors.
+    Gradient steps move the trainer's own weights (``online``); ``average`` holds their exponential moving average and
+    is what :meth:`evaluate` asks. Both start anew, whatever the planner has learned before: its weights would not go
+    with the normaliser of other data. The planner handed in answers as before until :meth:`hand_over`, which
+    :meth:`train` ends with. A small regression learns from the same batches, as the bar for the planner's errors.
 
     All draws come from the trainer's own generator. On the CPU a resumed run ends bit for bit as if it had never
     stopped; a GPU's sums do not repeat themselves exactly. A GPU holds the data, makes the draws, and runs each update
     from the fourth on as one recorded graph. No update waits for it; losses are read at log times.
 
-    :param planner: trained in place; its normaliser is fitted to the training part of ``source``
+    :param planner: takes over the average and a normaliser fitted to the training part of ``source``
     :param source: windows of the true, undelayed states and the actions
     :param gradient_steps: updates of the whole training, over which a cosine learning rate falls to 0
-    :param held_out: fraction of the data, in whole episodes, that is kept for ``evaluate``; 0 for none
+    :param held_out: fraction of the data that is kept for ``evaluate``, see ``WindowSource.split``; 0 for none
     :param seed: of every draw
     :raises ValueError: when ``source`` does not fit the planner, or cannot be split
     """
@@ -113,12 +114,14 @@ class PlannerTrainer:
         training_source, held_source = source.split(held_out, seed) if held_out > 0 else (source, None)
         values = scaled_values(training_source.values, self.config.value_scale)
         self.source = replace(training_source, values=values).to(self.device)
-        windows = self.source.sample(N_NORMALIZER_WINDOWS, planner.window_length, self.generator)
-        planner.fit_normalizer(self.source.start_states(), self.source.start_actions(), windows)
-        self.online = copy.deepcopy(planner).train().requires_grad_(True)
-        with th.random.fork_rng(devices=[]):  # the initial weights are the only draw that takes no generator
+        sizes = planner.obs_dim, planner.act_dim, planner.max_delay
+        with th.random.fork_rng(devices=[]):  # initial weights are the only draws that take no generator
             th.manual_seed(seed)
-            self.yardstick = RegressionYardstick(planner.obs_dim, planner.act_dim, planner.max_delay).to(self.device)
+            self.average = InpaintingPlanner(*sizes, self.config).to(self.device).requires_grad_(False)
+            self.yardstick = RegressionYardstick(*sizes).to(self.device)
+        windows = self.source.sample(N_NORMALIZER_WINDOWS, planner.window_length, self.generator)
+        self.average.fit_normalizer(self.source.start_states(), self.source.start_actions(), windows)
+        self.online = copy.deepcopy(self.average).train().requires_grad_(True)
         fused: dict[str, Any] = {"fused": on_gpu or self.device.type == "cpu", "capturable": on_gpu}
         self.optimizer = th.optim.AdamW(
             self.online.parameters(),
@@ -130,9 +133,9 @@ class PlannerTrainer:
         self.yardstick_optimizer = th.optim.Adam(
             self.yardstick.parameters(), lr=self._rate(YARDSTICK_LEARNING_RATE), **fused
         )
-        self._modules = {"planner": planner, "online": self.online, "yardstick": self.yardstick}
+        self._modules = {"average": self.average, "online": self.online, "yardstick": self.yardstick}
         self._optimizers = {"optimizer": self.optimizer, "yardstick_optimizer": self.yardstick_optimizer}
-        self._averaged: list[th.Tensor] = list(planner.parameters())
+        self._averaged: list[th.Tensor] = list(self.average.parameters())
         self._online: list[th.Tensor] = list(self.online.parameters())
         # Read at log times only: a read per update would make a GPU wait for it.
         self._loss_sums = th.zeros(2, device=self.device)
@@ -144,7 +147,7 @@ class PlannerTrainer:
     def step(self) -> None:
         """Make one update.
 
-        :raises FloatingPointError: when a loss was not finite (looked at every 100 updates)
+        :raises FloatingPointError: when an update was not finite (looked at every 100 updates)
         """
         rate = learning_rate(self.n_updates, self.gradient_steps, self.config)
         yardstick_rate = rate * YARDSTICK_LEARNING_RATE / self.config.learning_rate
@@ -167,9 +170,9 @@ class PlannerTrainer:
         config = self.config
         for optimizer in self._optimizers.values():
             optimizer.zero_grad()
-        windows = self.source.sample(config.batch_size, self.planner.window_length, self.generator)
+        windows = self.source.sample(config.batch_size, self.average.window_length, self.generator)
         mask = config.mask, config.mask_end_probability
-        delay = draw_delays(config.batch_size, self.planner.max_delay, *mask, self.generator).to(self.device)  # (B,)
+        delay = draw_delays(config.batch_size, self.average.max_delay, *mask, self.generator).to(self.device)  # (B,)
         weight = window_weight(windows.values, config.weight_factor)  # (B,)
         loss = self.online.loss(windows, delay, weight, self.generator)
         loss.backward()
@@ -177,7 +180,7 @@ class PlannerTrainer:
             th.nn.utils.clip_grad_norm_(self._online, config.gradient_clip)
         self.optimizer.step()
 
-        windows = windows._replace(states=self.planner.normalizer.normalize_states(windows.states))
+        windows = windows._replace(states=self.average.normalizer.normalize_states(windows.states))
         yardstick_loss = self.yardstick.loss(windows, delay, weight)
         yardstick_loss.backward()
         self.yardstick_optimizer.step()
@@ -186,17 +189,29 @@ class PlannerTrainer:
     def train(
         self, n_steps: int | None = None, callback: Callable[[PlannerTrainer], bool | None] | None = None
     ) -> bool:
-        """Make up to ``n_steps`` updates, by default all that are left.
+        """Make up to ``n_steps`` updates, by default all that are left, and hand the average over.
 
         :param callback: called with the trainer after every update; training stops when it returns False
         :return: whether it ran to the end
+        :raises FloatingPointError: when an update was not finite; the planner stays as it was
         """
+        runs = True
         for _ in range(self.gradient_steps - self.n_updates if n_steps is None else n_steps):
             self.step()
             if callback is not None and callback(self) is False:
-                return False
+                runs = False
+                break
+        self.hand_over()
+        return runs
+
+    def hand_over(self) -> None:
+        """Give the planner the averaged weights and their normaliser; before the first update, leave it as it is.
+
+        :raises FloatingPointError: when an update was not finite; the planner stays as it was
+        """
         self._check_finite()
-        return True
+        if self.n_updates > 0:
+            self.planner.load_state_dict(self.average.state_dict())
 
     def pop_losses(self) -> dict[str, float]:
         """Return the mean losses since the last call, and the learning rate of the last update."""
@@ -216,12 +231,12 @@ class PlannerTrainer:
         regression's. The planner decodes with its averaged weights, one candidate and temperature 0.
         """
         self._check_finite()
-        metrics, normalize = {}, self.planner.normalizer.normalize_states
+        metrics, normalize = {}, self.average.normalizer.normalize_states
         for d, windows in self._held_out.items():
             states, actions = windows.states, windows.actions
             delay = th.full((len(states),), d, device=self.device)
-            history = F.pad(actions[:, :d], (0, 0, self.planner.max_delay - d, 0))  # (B, D, act_dim), as an agent has
-            plan = self.planner.plan(states[:, 0], history, delay, temperature=0.0)
+            history = F.pad(actions[:, :d], (0, 0, self.average.max_delay - d, 0))  # (B, D, act_dim), as an agent has
+            plan = self.average.plan(states[:, 0], history, delay, temperature=0.0)
             present, decision = self.yardstick(normalize(states[:, 0]), actions, delay)
             for name, state, action in (
                 ("", normalize(plan.present), plan.action),
@@ -279,20 +294,22 @@ class PlannerTrainer:
 
     def _check_finite(self) -> None:
         bad = int(self._bad_update)
+        if bad < 0 and not th.stack(th._foreach_norm(self._averaged)).isfinite().all():
+            bad = self.n_updates - 1  # its gradient, and no loss came after it
         if bad >= 0:
             raise FloatingPointError(
-                f"The planner's loss was not finite in update {bad} (of {self.gradient_steps}). Check the data for "
-                f"infinite values; else lower learning_rate ({self.config.learning_rate}) or lengthen warmup_steps "
-                f"({self.config.warmup_steps})."
+                f"Update {bad} (of {self.gradient_steps}) of the planner was not finite; the planner stays as it was "
+                "before this training. Check the data for infinite values; else lower learning_rate "
+                f"({self.config.learning_rate}) or lengthen warmup_steps ({self.config.warmup_steps})."
             )
 
     def _draw_held_out(self, source: WindowSource, seed: int) -> dict[int, Windows]:
         """Return windows of every delay that the planner is trained for; a delay longer than all episodes has none."""
-        D, generator = self.planner.max_delay, th.Generator().manual_seed(seed)
+        D, generator = self.average.max_delay, th.Generator().manual_seed(seed)
         held_out = {}
         for d in [D] if self.config.mask == "fixed" else range(D + 1):
             long_enough = th.nonzero(source.remaining > d)[:, 0]  # index d, the decision, is in the same episode
             starts = long_enough[th.randperm(len(long_enough), generator=generator)[:HELD_OUT_WINDOWS]]
             if len(starts):
-                held_out[d] = source.gather(starts, self.planner.window_length).to(self.device)
+                held_out[d] = source.gather(starts, self.average.window_length).to(self.device)
         return held_out

@@ -8,7 +8,7 @@ import torch as th
 
 from sb3_said.replay.windows import WindowSource
 
-VALUE_SCALES = ("rank", "range")
+VALUE_SCALES = ("rank", "range", "centred")
 
 
 def returns_to_go(
@@ -23,7 +23,7 @@ def returns_to_go(
 
     :param source: M starts
     :param gamma: discount factor
-    :param terminal_penalty: replaces the reward of a terminating step (paper, Table 5); None keeps it
+    :param terminal_penalty: replaces the reward of a terminating step (paper, Table 3); None keeps it
     :param value_fn: (states (K, obs_dim), actions (K, act_dim)) -> (K,), the value of the last stored step of an
         episode that was cut off. Without it an episode is taken to go on at its average reward
     :return: (M,) float32
@@ -54,24 +54,26 @@ def returns_to_go(
 
 
 def scaled_values(values: th.Tensor, scale: str) -> th.Tensor:
-    """Map values to [0, 1], as the weight expects.
+    """Map values to V of the weight exp(beta (V - 1)), which is at most 1.
 
     :param values: (M,)
-    :param scale: ``"range"``, the place between the lowest and the highest (paper), ones where all are equal; or
-        ``"rank"``, the part of the others that a value is above, equal ones counted half
+    :param scale: ``"rank"``, the part of the others that a value is above, equal ones counted half; ``"range"``, the
+        place between the lowest and the highest, in [0, 1]; ``"centred"``, the same place in [-1, 1], as in the code
+        under the paper's results (DV), where beta counts twice as much. The last two give ones where all are equal
     """
-    if scale == "range":
+    if scale != "rank":
         low, high = values.min(), values.max()
-        return th.ones_like(values) if low == high else (values - low) / (high - low)
+        place = th.ones_like(values) if low == high else (values - low) / (high - low)
+        return 2.0 * place - 1.0 if scale == "centred" else place
     ordered = values.sort().values
     below, up_to = th.searchsorted(ordered, values), th.searchsorted(ordered, values, right=True)  # (M,)
     return (below + up_to - 1) / (2 * max(1, len(values) - 1))
 
 
 def window_weight(values: th.Tensor, weight_factor: float) -> th.Tensor:
-    """Return exp(beta (V - 1)), the weight of a window whose first state has the scaled value V in [0, 1].
+    """Return exp(beta (V - 1)), the weight of a window whose first state has the scaled value V (paper, Appendix B.4).
 
-    :param values: (B,) V
+    :param values: (B,) V, of :func:`scaled_values`
     :param weight_factor: beta; 0 weighs all windows alike
     """
     return th.exp(weight_factor * (values - 1.0))

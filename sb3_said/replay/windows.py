@@ -92,24 +92,31 @@ class WindowSource:
         return WindowSource(**{field.name: getattr(self, field.name).to(device) for field in fields(self)})
 
     def split(self, held_out: float, seed: int = 0) -> tuple[WindowSource, WindowSource]:
-        """Split by whole episodes into a training and a held-out source.
+        """Split by episodes into a training and a held-out source, so that no step is in windows of both.
 
-        Episodes are drawn at random until the held-out part has at least ``held_out`` of all starts.
+        Episodes are drawn at random and held out as a whole. Of the last one drawn, no more than the end is, so that
+        few or long episodes do not cost the training more than it was asked for.
 
-        :param held_out: fraction of the starts to hold out, in (0, 1)
+        :param held_out: fraction of the starts to hold out, in (0, 1); at least one is
         :param seed: of the draw
-        :raises ValueError: when there are fewer than two episodes, so that one part would be empty
+        :raises ValueError: when there are fewer than two starts, so that one part would be empty
         """
-        numbers, sizes = th.unique(self.episodes, return_counts=True)
-        if len(numbers) < 2:
+        if len(self) < 2:
             raise ValueError(
-                "Holding out windows needs at least two episodes, but the data has "
-                f"{len(numbers)}; collect more episodes or train without held-out windows."
+                f"Holding out windows needs at least two stored steps, got {len(self)}; collect more, or train without "
+                "held-out windows."
             )
+        wanted = max(1, int(held_out * len(self)))
+        numbers, sizes = th.unique(self.episodes, return_counts=True)
         order = th.randperm(len(numbers), generator=th.Generator().manual_seed(seed))
-        n_held_out = int((sizes[order].cumsum(0) < held_out * len(self)).sum()) + 1
-        held = th.isin(self.episodes, numbers[order[: min(n_held_out, len(numbers) - 1)]])
-        return self._select(~held), self._select(held)
+        before = sizes[order].cumsum(0) - sizes[order]  # starts of the episodes drawn earlier
+        drawn = numbers[order[before < wanted]]
+        end = wanted - before[len(drawn) - 1]  # steps of the last one to hold out
+        in_last = self.episodes == drawn[-1]
+        held = th.isin(self.episodes, drawn[:-1]) | (in_last & (self.remaining <= end))
+        training = self._select(~held)
+        remaining = th.where(in_last[~held], training.remaining - end, training.remaining)
+        return replace(training, remaining=remaining), self._select(held)
 
     def start_states(self) -> th.Tensor:
         """Return the state of every start: (n_starts, obs_dim)."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 import io
 import pathlib
 import warnings
+from difflib import get_close_matches
 from typing import Any, ClassVar
 
 import numpy as np
@@ -50,6 +52,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
     :param sac_kwargs: every other argument of :class:`stable_baselines3.SAC`
     :raises ValueError: for other spaces, a ``VecNormalize`` of more than the observation, or options that need another
         replay buffer (``n_steps`` > 1) or policy
+    :raises TypeError: for an unknown argument
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -73,6 +76,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
         relabelled_ages: float = 0.5,
         **sac_kwargs: Any,
     ):
+        self._refuse_unknown(sac_kwargs)
         if sac_kwargs.get("n_steps", 1) != 1:
             raise ValueError(
                 f"DelayedSAC learns from one-step targets, got n_steps={sac_kwargs['n_steps']}; leave it 1."
@@ -84,6 +88,14 @@ class DelayedSAC(SafeSaveMixin, SAC):
         if isinstance(policy, str):  # SB3 takes one name for Box spaces and the other for Dict
             policy = self.policy_aliases.get(policy, policy)  # type: ignore[assignment]
         super().__init__(policy, env, learning_rate, learning_starts=learning_starts, **sac_kwargs)
+
+    def _refuse_unknown(self, sac_kwargs: dict[str, Any]) -> None:
+        """:raises TypeError: for an argument that SAC does not have either, with the nearest name of all there are"""
+        for unknown in sorted(set(sac_kwargs) - set(inspect.signature(SAC).parameters)):
+            names = sorted((self._argument_names() | {"device", "tensorboard_log"}) - {"policy_class"})
+            nearest = get_close_matches(unknown, names, n=1)
+            hint = f"did you mean {nearest[0]}?" if nearest else f"it has {', '.join(names)}."
+            raise TypeError(f"{type(self).__name__} has no argument {unknown}; {hint}")
 
     def _setup_model(self) -> None:
         name, policy_class = type(self).__name__, self.policy_aliases["MlpPolicy"]

@@ -100,6 +100,29 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         tensors = {key: th.as_tensor(x if is_batch else x[None], device=self.device) for key, x in arrays.items()}
         return tensors if is_delayed else tensors["observation"], is_batch
 
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Answer as SB3 does, and only with actions of the action space: whoever answers, they all pass here.
+
+        :raises ValueError: as :meth:`obs_to_tensor`, and for an action that is not finite
+        """
+        actions, state = super().predict(observation, state, episode_start, deterministic)
+        if not np.isfinite(actions).all():
+            parts = observation.values() if isinstance(observation, dict) else [observation]
+            largest = max(float(np.abs(part).max(initial=0.0)) for part in parts)
+            raise ValueError(
+                f"The action is not finite. The largest entry of the observation is {largest:.3g}: keep it near what "
+                "the agent was trained on; else the agent's own weights are not finite, and its training diverged."
+            )
+        space = self.action_space
+        assert isinstance(space, spaces.Box)  # as check_spaces says
+        return np.clip(actions, space.low, space.high), state  # scaling to the bounds may round to beyond them
+
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {
             **super()._get_constructor_parameters(),

@@ -121,6 +121,8 @@ class SAIDPolicy(DelayedSACPolicy):
         :param actions: (..., act_dim) in [-1, 1]
         :return: (...)
         """
+        if self.critic.training:  # SB3 leaves it so; Dropout would draw, and BatchNorm learn from plans
+            self.critic.set_training_mode(False)
         flat = states.flatten(0, -2)
         observation: PyTorchObs = flat if self.replay_space is None else {UNDELAYED: flat}
         return th.cat(self.critic(observation, actions.flatten(0, -2)), dim=1).amin(1).view(states.shape[:-1])

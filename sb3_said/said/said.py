@@ -10,6 +10,7 @@ from typing import Any, ClassVar, TypeVar
 
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import configure_logger
@@ -25,7 +26,7 @@ from sb3_said.said.callbacks import PlannerTrainingCallback
 from sb3_said.said.policies import Answer, SAIDPolicy
 from sb3_said.said.trial import let_the_better_answer
 
-HELD_OUT = 0.05  # of the planner's data, in whole episodes
+HELD_OUT = 0.05  # of the planner's data
 PLANNER_CHECKPOINT_NAME = "planner_checkpoint.zip"
 
 SelfSAID = TypeVar("SelfSAID", bound="SAID")
@@ -45,10 +46,11 @@ class SAID(DelayedSAC):
     :param planner_kwargs: fields of :class:`~sb3_said.planner.PlannerConfig`; the attribute has all of them
     :param planner_gradient_steps: updates of one planner training; the paper makes 1,000,000
     :param planner_train_freq: also train the planner every so many environment steps; the paper only at the end (None)
-    :param planner_newest_fraction: train on the newest part of the buffer only. The paper finds its newest 20 % as good
-        as all; here it is better, where policies change fast
-    :param planner_terminal_penalty: replaces the reward of a terminating step in the values that weigh windows (paper,
-        Table 5); None keeps it, for tasks that end when they are done
+    :param planner_newest_fraction: train on the newest part of the buffer only. The paper takes all of it (Algorithm 1)
+        and finds the newest 20 % as good; here they are better, where policies change fast
+    :param planner_terminal_penalty: replaces the reward of a terminating step in the values that weigh windows. The
+        paper's Table 3 has -100, for tasks that end by falling, and the presets of such tasks have it too; None keeps
+        the reward, for tasks that may end because they are done
     :param planner_trial_episodes: of the training environment, played with the planner after its training and as many
         with the expert; the better one answers. They come on top of ``learn``'s steps. 0: the planner answers
     :param sac_kwargs: every other argument of :class:`~sb3_said.sac.DelayedSAC` and of SB3's ``SAC``
@@ -70,7 +72,7 @@ class SAID(DelayedSAC):
         planner_gradient_steps: int = 25_000,
         planner_train_freq: int | None = None,
         planner_newest_fraction: float = 0.2,
-        planner_terminal_penalty: float | None = -100.0,
+        planner_terminal_penalty: float | None = None,
         planner_trial_episodes: int = 5,
         **sac_kwargs: Any,
     ):
@@ -205,7 +207,7 @@ class SAID(DelayedSAC):
             self.policy.planner,
             replace(source, values=values),
             self.planner_gradient_steps if gradient_steps is None else gradient_steps,
-            held_out=HELD_OUT if len(source.episodes.unique()) > 1 else 0.0,
+            held_out=HELD_OUT if len(source) > 1 else 0.0,
             seed=self.seed or 0,
         )
 
@@ -226,9 +228,13 @@ class SAID(DelayedSAC):
         save_interval: int = 1_000,
         trial_episodes: int | None = None,
     ) -> None:
-        """Train the planner on the replay buffer as it is, without running the expert; then see who answers better.
+        """Train the planner anew on the replay buffer, without running the expert; then see who answers better.
 
-        Interrupting (Ctrl-C) ends the training early and keeps the planner as far as it got.
+        Interrupting (Ctrl-C) ends the training early and keeps the planner as far as it got. Until the training ends,
+        and where it fails, the planner answers as before. Without ``verbose`` and a bar, one line says that it begins.
+
+        A row of the log is written at ``num_timesteps`` plus the updates made; with ``planner_train_freq`` at
+        ``num_timesteps`` alone, since the expert's rows go on from there.
 
         :param gradient_steps: ``planner_gradient_steps`` by default
         :param folder: keep a checkpoint there, and continue from it if it is of the same training
@@ -238,6 +244,7 @@ class SAID(DelayedSAC):
         :param save_interval: updates between two checkpoints
         :param trial_episodes: ``planner_trial_episodes`` by default; none are played where there is no environment
         :raises ValueError: when the buffer is empty, or the checkpoint is of a training with other settings
+        :raises FloatingPointError: when an update was not finite
         """
         if not hasattr(self, "_logger"):  # not set_logger: learn() makes its own
             self._logger = configure_logger(self.verbose, self.tensorboard_log, "SAID", reset_num_timesteps=False)
@@ -259,9 +266,7 @@ class SAID(DelayedSAC):
                 losses = trainer.pop_losses()
                 bar.set_postfix(loss=losses["planner/loss"])
                 errors = trainer.evaluate() if done % eval_interval == 0 or is_end else {}
-                for key, value in {**losses, **errors, "planner/n_updates": done}.items():
-                    self.logger.record(key, value)
-                self.logger.dump(self.num_timesteps + done)
+                self._log_planner({**losses, **errors, "planner/n_updates": done}, done)
                 if is_end and (worse := worse_than_regression(errors)):
                     warnings.warn(
                         f"On held-out windows the planner is still worse than a small regression: {worse}. It is "
@@ -271,15 +276,35 @@ class SAID(DelayedSAC):
             if checkpoint is not None and (done % save_interval == 0 or is_end):
                 save_tree(checkpoint, {**data, "trainer": trainer.state_dict()})
 
+        if trainer.n_updates < total and not progress_bar and self.verbose == 0:
+            print(
+                f"Training the planner: {total} updates. progress_bar=True or verbose=1 shows how far it is.",
+                flush=True,
+            )
         with tqdm(total=total, initial=trainer.n_updates, desc="planner", disable=not progress_bar) as bar:
             try:
                 trainer.train(callback=on_update)
             except KeyboardInterrupt:
-                print(f"Planner training interrupted after {trainer.n_updates} of {total} updates; its weights stay.")
-        if trainer.n_updates > 0:  # else an earlier training's stays
+                trainer.hand_over()
+                outcome = "keeps what it learned" if trainer.n_updates > 0 else "stays as it was"
+                print(f"Planner training interrupted after {trainer.n_updates} of {total} updates; it {outcome}.")
+                trial_episodes = 0
+        if trainer.n_updates > 0:
             self.policy.planner_updates.fill_(float(trainer.n_updates))
-            n_episodes = self.planner_trial_episodes if trial_episodes is None else trial_episodes
-            self.set_answer("planner")
-            if n_episodes > 0 and self.env is not None:
-                let_the_better_answer(self, n_episodes, progress_bar)
+            self._settle_answer(self.planner_trial_episodes if trial_episodes is None else trial_episodes, progress_bar)
         self._planner_trained_at = self.num_timesteps
+
+    def _settle_answer(self, n_episodes: int, progress_bar: bool) -> None:
+        """Let the newly trained planner answer, or whoever is better in a trial."""
+        self.set_answer("planner")
+        if n_episodes > 0 and self.env is not None:
+            returns = let_the_better_answer(self, n_episodes, progress_bar)
+            self._log_planner(returns, int(self.policy.planner_updates))
+
+    def _log_planner(self, values: dict[str, float], n_updates: int) -> None:
+        """Write a row with a logger of its own, to the same places: the user's keeps what it holds for its next row."""
+        log = Logger(self.logger.dir, self.logger.output_formats)
+        log.set_level(self.logger.level)
+        for key, value in values.items():
+            log.record(key, value)
+        log.dump(self.num_timesteps + (n_updates if self.planner_train_freq is None else 0))

@@ -48,13 +48,13 @@ def play_trial(model: SAID, n_episodes: int, progress_bar: bool = False) -> dict
     return returns
 
 
-def let_the_better_answer(model: SAID, n_episodes: int, progress_bar: bool = False) -> None:
-    """Let whoever has the higher mean return answer ``predict``, log both, and warn where that is the expert."""
+def let_the_better_answer(model: SAID, n_episodes: int, progress_bar: bool = False) -> dict[str, float]:
+    """Let whoever has the higher mean return answer ``predict``, and warn where that is the expert.
+
+    :return: both means, for the log
+    """
     returns = play_trial(model, n_episodes, progress_bar)
     means = {who: float(played.mean()) for who, played in returns.items()}
-    for who, mean in means.items():
-        model.logger.record(f"trial/{who}_return", mean)
-    model.logger.dump(model.num_timesteps)
     model.set_answer("planner" if means["planner"] >= means["expert"] else "expert")
     if means["planner"] < means["expert"]:
         warnings.warn(
@@ -63,3 +63,4 @@ def let_the_better_answer(model: SAID, n_episodes: int, progress_bar: bool = Fal
             "mend the planner; set_answer('planner') lets it answer all the same.",
             stacklevel=3,
         )
+    return {f"trial/{who}_return": mean for who, mean in means.items()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,11 @@ from typing import Any
 import numpy as np
 
 from sb3_said.delays.text import make_process
-from sb3_said.evaluation import Summary, bootstrap_interval
+from sb3_said.evaluation import confidence_interval
 from sb3_said.files.atomic import write_json
+
+#: Returns by row and delay: (n_episodes,), or (n_seeds, n_episodes) of several training seeds.
+Table = dict[str, dict[int | str, np.ndarray]]
 
 
 @dataclass
@@ -76,36 +80,55 @@ class Results:
         write_json(self.path, {**self.settings, "origins": self.origins, "cells": cells})
 
 
-def make_table(cells: list[Cell], rows: list[str]) -> dict[str, dict[int | str, Summary]]:
-    """Return the summary of each row's agent under each delay that it could play."""
-    table: dict[str, dict[int | str, Summary]] = {row: {} for row in rows}
+def make_table(cells: list[Cell], rows: Mapping[str, str]) -> Table:
+    """Return what each row's agent returned under each delay that it could play.
+
+    Several cells of one agent and one delay are of several training seeds.
+
+    :param rows: agents, each with the name that the table shows
+    """
+    played: dict[str, dict[int | str, list[list[float]]]] = {agent: {} for agent in rows}
     for cell in cells:
-        if cell.agent in table and (result := cell.result) is not None:
-            table[cell.agent][cell.delay] = Summary.from_episodes(cell.agent, result["returns"], result["lengths"])
-    return table
+        if cell.agent in played and (result := cell.result) is not None:
+            played[cell.agent].setdefault(cell.delay, []).append(result["returns"])
+    return {
+        rows[agent]: {delay: np.array(seeds if len(seeds) > 1 else seeds[0]) for delay, seeds in row.items()}
+        for agent, row in played.items()
+    }
 
 
-def print_table(table: dict[str, dict[int | str, Summary]], delays: list[int | str]) -> None:
-    """Print a Markdown table: one row for each agent, one column for each delay, then the averages."""
+def print_table(table: Table, delays: list[int | str]) -> None:
+    """Print a Markdown table: one row for each agent, one column for each delay, then the averages.
+
+    A line below it says what the intervals are over.
+    """
     columns: dict[str, list[int | str]] = {str(delay): [delay] for delay in delays}
     for name, kind in (("mean of fixed", int), ("mean of random", str)):
         columns[name] = [delay for delay in delays if isinstance(delay, kind)]
+    averages = {agent: [average(row, column) for column in columns.values()] for agent, row in table.items()}
     rows = [["return under delay", *columns]]
-    rows += [[agent, *(average(row, column) for column in columns.values())] for agent, row in table.items()]
+    rows += [[agent, *(text for text, _ in row)] for agent, row in averages.items()]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     rows.insert(1, ["-" * width for width in widths])
     for row in rows:
         print("| " + " | ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)) + " |")
+    units = dict.fromkeys(over for row in averages.values() for _, over in row if over)
+    print(f"95 % intervals over {', or '.join(units)}")
 
 
-def average(row: dict[int | str, Summary], delays: list[int | str]) -> str:
-    """Write the mean return over delays, with its interval over reset seeds.
+def average(row: Mapping[int | str, np.ndarray], delays: list[int | str]) -> tuple[str, str]:
+    """Write the mean return over delays with its interval, and what that is over: training seeds, or reset seeds.
 
     :param row: of an agent
-    :param delays: those that the agent cannot play are left out, and the rest is counted
+    :param delays: those that the agent cannot play are left out, and the rest is counted. Delays of different numbers
+        of training seeds have a mean and no interval
     """
-    returns = [row[delay].returns for delay in delays if delay in row]
+    returns = [row[delay] for delay in delays if delay in row]
     if not returns:
-        return "-"
-    interval = str(bootstrap_interval(np.mean(returns, axis=0)))  # from (delays, n_episodes)
-    return interval if len(returns) == len(delays) else f"{interval}, {len(returns)} of {len(delays)}"
+        return "-", ""
+    covered = "" if len(returns) == len(delays) else f", {len(returns)} of {len(delays)}"
+    if len({one.shape for one in returns}) > 1:
+        return f"{np.mean([one.mean() for one in returns]):.1f}{covered}", ""
+    interval = confidence_interval(np.mean(returns, axis=0))  # from (delays, n_episodes) or (delays, seeds, n_episodes)
+    units = "episodes" if returns[0].ndim == 1 else "training seeds"
+    return f"{interval}{covered}", f"{interval.n} {units} ({interval.method})"

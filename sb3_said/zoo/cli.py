@@ -12,14 +12,15 @@ usage: sb3-said COMMAND ...
   evaluate     measure a trained agent: mean return over seeded episodes, and how long a decision takes
   enjoy        watch a trained agent, in a window or as a video
   over-delays  play trained agents under several delays: a table and a plot of return over delay
-  tune         search the planner's depth, temperature and denoising steps for a trained run
+  tune         search the planner's depth, temperature, denoising steps and choice factor for a trained run
+  decide       set how a trained agent decides: temperature, candidates, denoising steps, choice factor
 
 sb3-said COMMAND --help shows the options of a command, with examples. A first try, of two minutes:
 
   sb3-said train --algo said --env Pendulum-v1 --delay 2 --preset smoke
   sb3-said evaluate logs/said/Pendulum-v1-delay2_1
 """
-COMMANDS = ("train", "evaluate", "enjoy", "over-delays", "tune")
+COMMANDS = ("train", "evaluate", "enjoy", "over-delays", "tune", "decide")
 
 
 def main() -> None:

@@ -62,7 +62,7 @@ def main(argv: list[str] | None = None) -> None:
     write_json(target, document)
     print(f"Wrote {target}")
     if args.plot is not None:
-        draw(args.plot, summaries, run.folder)
+        draw(args.plot, summaries, run.folder, f"{run.info['algo']} on {run.info['env']}, delay {run.info['delay']}")
         print(f"Wrote {args.plot}")
 
 
@@ -95,8 +95,11 @@ def print_table(summaries: list[Summary]) -> None:
         print(f"{s.label:10} {s.mean_return.value:12,.1f} {interval:>24} {s.mean_length.value:8,.1f}   {speed}")
 
 
-def draw(path: Path, summaries: list[Summary], folder: Path) -> None:
-    """Draw the returns, and beside them the training curves whose files lie in the run folder."""
+def draw(path: Path, summaries: list[Summary], folder: Path, title: str) -> None:
+    """Draw the returns, and beside them the training curves whose files lie in the run folder.
+
+    :param title: names the task and its delay
+    """
     drawings: list[Any] = [partial(plots.plot_returns, summaries)]
     if any(folder.glob("*monitor.csv")):
         drawings.append(partial(plots.plot_learning_curve, folder))
@@ -106,7 +109,7 @@ def draw(path: Path, summaries: list[Summary], folder: Path) -> None:
         for kind in ("present", "action")
         if any(f"planner/{kind}_error" in header for header in headers)
     ]
-    axes = plots.panels(len(drawings))
+    axes = plots.panels(len(drawings), title)
     for ax, drawing in zip(axes, drawings, strict=True):
         drawing(ax=ax)
     plots.save(axes[0], path)

@@ -30,16 +30,21 @@ examples:
   sb3-said over-delays any=logs/said/Hopper-v5-delay0-16_1 d8=logs/sadr/Hopper-v5-delay8_1 --workers 2 \\
       --delays 0 2 4 8 12 16 "UniformDelay(0, 8)" WIFI_20MS --json hopper.json --plot hopper.png
 
-  # runs that share a label are one row: each plays the delay that it was trained under
+  # training seeds of one setting share a label: they are one row, with intervals over the seeds
+  sb3-said over-delays d4=logs/said/Hopper-v5-delay4_1 d4=logs/said/Hopper-v5-delay4_2 \\
+      d4=logs/said/Hopper-v5-delay4_3 --delays 0 2 4 --json seeds.json
+
+  # runs of several delays that share a label are one row, too: each plays the delay that it was trained under
   sb3-said over-delays any=logs/said/Hopper-v5-delay0-16_1 each=logs/said/Hopper-v5-delay0_1 \\
       each=logs/said/Hopper-v5-delay4_1 each=logs/said/Hopper-v5-delay16_1 --delays 0 4 16 --json hopper.json
 
-  # some rows and delays again; without runs nothing is played
-  sb3-said over-delays --json hopper.json --rows "any planner" "each planner" --delays 0 4 16 --plot hopper.png
+  # some rows and delays again, under names for readers; without runs nothing is played
+  sb3-said over-delays --json hopper.json --rows "any planner=one agent" "each planner=an agent for each delay" \\
+      --delays 0 4 16 --plot hopper.png
 
 A delay longer than an agent was built for leaves an empty cell. One that it was not trained with is played, without a
-warning. Episode i starts from reset seed --seed + i in every cell. An average over delays has an interval over these
-starts.
+warning. Episode i starts from reset seed --seed + i in every cell. A row of one agent has intervals over these starts,
+a row of several training seeds over the seeds: by BCa bootstrap, or by Student's t where there are fewer than 10.
 A call plays only the cells that --json lacks, so the same command goes on after a stop. An agent whose file has changed
 is played again. The file keeps the cells of other agents and delays.
 {TRUST}
@@ -55,8 +60,9 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--answer", choices=ANSWERS, help="who acts in SAID agents (default: both, as two rows)")
     parser.add_argument("--json", type=Path, required=True, help="file of the numbers, read and written")
     parser.add_argument("--plot", type=Path, help="draw return over delay to this .png or .pdf")
-    parser.add_argument("--rows", nargs="+", metavar="ROW", help="rows of the table and the plot, in this order, each "
-                        "a label, and 'LABEL planner' or 'LABEL expert' of a SAID agent (default: all)")  # fmt: skip
+    parser.add_argument("--rows", nargs="+", metavar="ROW[=NAME]", help="rows of table and plot, in this order: "
+                        "each a label, or 'LABEL planner' or 'LABEL expert' of a SAID agent, shown as NAME (default: "
+                        "all)")  # fmt: skip
     add_playing(parser, episodes=20)
     parser.add_argument("--n-envs", type=int, default=8, help="episodes played side by side (default: 8)")
     parser.add_argument("--workers", type=int, default=1, help="cells played at once, in processes (default: 1)")
@@ -73,7 +79,9 @@ def main(argv: list[str] | None = None) -> None:
     table = make_table(shown, rows)
     print_table(table, delays or list(dict.fromkeys(cell.delay for cell in shown)))
     if args.plot is not None and any(table.values()):
-        plots.save(plots.plot_over_delays(table)[0], args.plot)
+        settings = Results(args.json).settings
+        title = f"{settings['env']} under delay: means of {settings['n_episodes']} episodes, 95 % intervals"
+        plots.save(plots.plot_over_delays(table, title)[0], args.plot)
         print(f"Wrote {args.plot}")
 
 
@@ -88,15 +96,20 @@ def read_name(word: str) -> int | str:
     return process.delay if isinstance(process, FixedDelay) else word
 
 
-def choose_rows(names: list[str] | None, cells: list[Cell]) -> list[str]:
-    """Return the rows of the table: those asked for, or all.
+def choose_rows(words: list[str] | None, cells: list[Cell]) -> dict[str, str]:
+    """Return the rows of the table, those asked for or all, each with the name that it is shown under.
 
-    :raises ValueError: for a row that there is not
+    :param words: each a row, or ROW=NAME
+    :raises ValueError: for a row that there is not, and a name given twice
     """
     known = list(dict.fromkeys(cell.agent for cell in cells))
-    if unknown := [name for name in names or () if name not in known]:
+    pairs = [(word, "=", word) if word in known else word.partition("=") for word in words or known]
+    rows = {row: name or row for row, _, name in pairs}
+    if unknown := [row for row in rows if row not in known]:
         raise ValueError(f"--rows names {', '.join(unknown)}, but the rows are {', '.join(known)}.")
-    return names or known
+    if len(set(rows.values())) < len(pairs):
+        raise ValueError(f"--rows names a row twice, or two rows alike: {', '.join(words or known)}.")
+    return rows
 
 
 def known_cells(path: Path, delays: list[int | str]) -> list[Cell]:
@@ -157,9 +170,9 @@ def print_settings(settings: dict[str, Any]) -> None:
 
 
 def open_runs(args: argparse.Namespace) -> dict[str, list[LoadedRun]]:
-    """Return what each label names: one run, or one for each of several delays.
+    """Return what each label names: one run, training seeds of one delay, or runs of several delays.
 
-    :raises ValueError: for what cannot be opened, runs of one label and one delay, or runs of several tasks
+    :raises ValueError: for what cannot be opened, an agent that stands twice under a label, or runs of several tasks
     """
     runs: dict[str, list[LoadedRun]] = {}
     for text in args.runs:
@@ -168,10 +181,10 @@ def open_runs(args: argparse.Namespace) -> dict[str, list[LoadedRun]]:
         with at_any_age():
             run = load_run(path, args.algo, args.env, None, args.device)
         row = runs.setdefault(label, [])
-        if any(run.info["delay"] == other.info["delay"] for other in row):
+        if any(digest_of(run) == digest_of(other) for other in row):
             raise ValueError(
-                f"Two runs have the label {label} and the delay {run.info['delay']}: give each its own label, as in "
-                f"LABEL={path}."
+                f"The label {label} has the agent {run.info['file']} twice: give it other training seeds of the same "
+                f"setting, or give each run its own label, as in LABEL={path}."
             )
         row.append(run)
     tasks = sorted({run.info["env"] for row in runs.values() for run in row})
@@ -188,17 +201,23 @@ def at_any_age() -> Iterator[None]:
         yield
 
 
+def digest_of(run: LoadedRun) -> str:
+    """Return the SHA-256 of an agent's file."""
+    return hashlib.sha256(Path(run.info["file"]).read_bytes()).hexdigest()
+
+
 def cells_of(label: str, row: list[LoadedRun], delays: list[int | str], only: str | None = None) -> Iterator[Cell]:
     """Make the cells of a label: each who can answer, under each delay.
 
-    :param row: one run, which plays all delays, or several, of which each plays the delay it was trained under
+    :param row: runs of one delay, which play all delays; or of several, of which each plays its own
     :param only: who of a SAID agent is to answer, planner or expert; both by default
     """
-    digests = [hashlib.sha256(Path(run.info["file"]).read_bytes()).hexdigest() for run in row]
+    one_delay = len({run.info["delay"] for run in row}) == 1
+    digests = [digest_of(run) for run in row]
     who = [answers(run.model) for run in row]
     for answer, delay in itertools.product(dict.fromkeys(itertools.chain(*who)), delays):
         for run, digest, can_answer in zip(row, digests, who, strict=True):
-            plays = len(row) == 1 or run.info["delay"] == delay_name(make_process(delay))
+            plays = one_delay or run.info["delay"] == delay_name(make_process(delay))
             if not plays or answer not in can_answer or (answer and only and answer != only):
                 continue
             yield Cell(

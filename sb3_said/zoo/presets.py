@@ -26,9 +26,10 @@ def preset_overrides(
 ) -> dict[str, Any]:
     """Return what a preset changes for a task: its own entry of ``presets:`` in the file, or the preset's default.
 
-    ``cpu`` changes nothing: it is the constructors' defaults. Two keys are for planners:
-    ``planner_kwargs: {base: paper, ...}`` starts from ``PlannerConfig.paper()``, and ``planner_by_delay`` holds
-    settings to add, by the largest delay and under ``varies`` for delays that are not one number.
+    ``cpu`` changes nothing of the file's block for the task: the constructors' defaults, and a
+    ``planner_terminal_penalty`` for tasks that end by falling. Two keys are for planners: ``planner_kwargs: {base:
+    paper, ...}`` starts from ``PlannerConfig.paper()``, and ``planner_by_delay`` holds settings to add, by the largest
+    delay and under ``varies`` for delays that are not one number.
 
     :param max_delay: length of the action history, the largest of ``delay`` by default; a longer one varies, too
     :raises ValueError: for a preset the file does not have

@@ -74,7 +74,7 @@ def load_run(
     :param env_kwargs: more arguments for ``gymnasium.make``, such as ``render_mode``
     :raises ValueError: when the files do not say what to load, or the agent does not fit the task
     """
-    file, params = _find(Path(path))
+    file, params = find_agent(Path(path))
     hyperparams, args = read_params(params)
     algo = algo or args.get("algo")
     env_id = env_id or args.get("env")
@@ -107,6 +107,28 @@ def load_run(
     info = {"algo": algo, "env": env_id, "delay": delay_name(delay_process)}
     info |= {"file": str(file), "trained_steps": model.num_timesteps}
     return LoadedRun(model, make_env, _load_normalize(params, hyperparams, make_env), file.parent, info)
+
+
+def find_agent(path: Path) -> tuple[Path, Path | None]:
+    """Return the agent's file, and the folder of its run's YAML if it lies in a run folder.
+
+    :param path: a run folder, or an agent's ``.zip``
+    :raises ValueError: for a path without an agent
+    """
+    if not path.exists():
+        raise ValueError(f"{path} does not exist; give a run folder such as logs/said/Hopper-v5-delay4_1 or a .zip.")
+    params = [file.parent for file in (path if path.is_dir() else path.parent).glob("*/args.yml")]
+    if path.is_file():
+        return path, params[0] if len(params) == 1 else None
+    if len(params) != 1:
+        runs = sorted(str(p.parents[1]) for p in path.glob("**/args.yml"))
+        hint = f"it holds the runs {', '.join(runs)}" if runs else "rl_zoo3 makes one with every training"
+        raise ValueError(f"{path} is not a run folder with one */args.yml: {hint}.")
+    names = f"{params[0].name}.zip", "best_model.zip"
+    for name in names:
+        if (path / name).is_file():
+            return path / name, params[0]
+    raise ValueError(f"{path} has no finished agent: neither {names[0]} nor {names[1]}.")
 
 
 def delay_name(process: DelayProcess) -> int | str:
@@ -154,24 +176,6 @@ def origin(run: LoadedRun) -> dict[str, Any]:
         "torch_threads": th.get_num_threads(),
         "versions": {"python": platform.python_version(), "sb3_said": __version__, **{p: version(p) for p in packages}},
     }
-
-
-def _find(path: Path) -> tuple[Path, Path | None]:
-    """Return the agent's file, and the folder of its run's YAML if it lies in a run folder."""
-    if not path.exists():
-        raise ValueError(f"{path} does not exist; give a run folder such as logs/said/Hopper-v5-delay4_1 or a .zip.")
-    params = [file.parent for file in (path if path.is_dir() else path.parent).glob("*/args.yml")]
-    if path.is_file():
-        return path, params[0] if len(params) == 1 else None
-    if len(params) != 1:
-        runs = sorted(str(p.parents[1]) for p in path.glob("**/args.yml"))
-        hint = f"it holds the runs {', '.join(runs)}" if runs else "rl_zoo3 makes one with every training"
-        raise ValueError(f"{path} is not a run folder with one */args.yml: {hint}.")
-    names = f"{params[0].name}.zip", "best_model.zip"
-    for name in names:
-        if (path / name).is_file():
-            return path / name, params[0]
-    raise ValueError(f"{path} has no finished agent: neither {names[0]} nor {names[1]}.")
 
 
 def read_params(params: Path | None) -> tuple[dict[str, Any], dict[str, Any]]:

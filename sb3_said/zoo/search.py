@@ -22,6 +22,7 @@ from sb3_said.zoo.depths import check_same
 
 optuna.logging.set_verbosity(optuna.logging.ERROR)
 
+DRAWN = ("temperature", "choice_factor")  # real numbers, which tpe draws between the lowest and the highest
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 
 
@@ -47,11 +48,12 @@ def search(
     """Try settings of the planner on the same episodes, until no trial is left to begin.
 
     With the sampler ``grid`` every cell is tried once; at the end two workers may try the same one. ``tpe`` draws
-    temperatures between the lowest and the highest. A trial reports the return of every episode. It is pruned once a
-    Wilcoxon test of the differences to the best trial, episode by episode, says that it is worse.
+    temperatures and choice factors between the lowest and the highest. A trial reports the return of every episode. It
+    is pruned once a Wilcoxon test of the differences to the best trial, episode by episode, says that it is worse. At
+    temperature 0 nothing is chosen, so one choice factor is played for all.
 
     :param study: see ``open_study``
-    :param tried: values of ``depth``, ``temperature`` and ``sampling_steps``
+    :param tried: values of ``depth``, ``temperature``, ``sampling_steps`` and ``choice_factor``, or of some of them
     :param put: gives the agent such settings
     :param play: returns what the agent earned, (n,), in n episodes from a reset seed on
     :param sampler: ``grid`` or ``tpe``
@@ -64,8 +66,8 @@ def search(
 
     def objective(trial: Trial) -> float:
         params = suggest(trial, tried, sampler)
-        known = next((made for made in finished(study) if made.params == params), None)
-        if known is not None:  # of a smaller grid, in an earlier call
+        known = next((made for made in finished(study) if decisive(made.params) == decisive(params)), None)
+        if known is not None:  # of a smaller grid, in an earlier call, or of another choice where there is none
             return repeat(trial, known)
         try:
             put(**params)
@@ -97,13 +99,18 @@ def suggest(trial: Trial, tried: dict[str, list[Any]], sampler: str) -> dict[str
     """Let the sampler choose one of the settings."""
     params: dict[str, Any] = {}
     for name, values in tried.items():
-        if name == "temperature":
+        if name in DRAWN:
             params[name] = trial.suggest_float(name, min(values), max(values))
         elif sampler == "tpe":
             params[name] = trial.suggest_categorical(name, values)
         else:  # a range, which can grow with the grid; the choices of a category cannot
             params[name] = trial.suggest_int(name, min(values), max(values))
     return params
+
+
+def decisive(params: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings that change an answer."""
+    return {name: value for name, value in params.items() if name != "choice_factor" or params["temperature"] > 0}
 
 
 def repeat(trial: Trial, known: FrozenTrial) -> float:
@@ -190,9 +197,10 @@ def returns_of(trial: FrozenTrial) -> list[float]:
     return [trial.intermediate_values[step] for step in sorted(trial.intermediate_values)]
 
 
-def save_plot(study: optuna.Study, path: Path) -> None:
+def save_plot(study: optuna.Study, path: Path, title: str) -> None:
     """Draw the mean return over each setting, of complete trials.
 
+    :param title: names the task and its delay
     :raises ImportError: without matplotlib
     """
     import matplotlib
@@ -203,5 +211,8 @@ def save_plot(study: optuna.Study, path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         axes = np.ravel(np.asarray(plot_slice(study, target_name="mean return")))
+    for ax in axes:
+        ax.set_title("")  # "Slice Plot"
+    axes[0].figure.suptitle(title)
     axes[0].figure.savefig(path, dpi=150, bbox_inches="tight")
     matplotlib.pyplot.close(axes[0].figure)

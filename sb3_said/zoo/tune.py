@@ -1,4 +1,4 @@
-"""Search the planner's depth, temperature and denoising steps for a trained SAID run, sharing its expert and replay."""
+"""Search the planner's depth and how it decides for a trained SAID run, sharing its expert and replay."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from sb3_said.zoo.best import write_best
 from sb3_said.zoo.depths import DepthPlanners
 from sb3_said.zoo.evaluate import evaluate, print_table
 from sb3_said.zoo.runs import ANSWERS, LoadedRun, load_run, origin
-from sb3_said.zoo.search import describe, find_winner, finished, open_study, returns_of, save_plot, search
+from sb3_said.zoo.search import DRAWN, describe, find_winner, finished, open_study, returns_of, save_plot, search
 
 EPILOG = f"""\
 examples:
@@ -38,6 +38,9 @@ examples:
 
   # a quick look: one depth, fewer updates, fewer episodes, in a folder of its own
   sb3-said tune --run logs/said/Hopper-v5-delay4_1 --depths 2 --gradient-steps 5000 --episodes 10 --output look
+
+  # how the critics choose: the larger the factor, the more the best candidate decides; 100 hardly asks another
+  sb3-said tune --run logs/said/Hopper-v5-delay4_1 --depths 2 --temperatures 0.5 1 --choice-factors 0.3 1 3 100
 
   # any temperature from 0 to 1, fewer denoising steps, in a data base
   sb3-said tune --run logs/said/Hopper-v5-delay4_1 --sampler tpe --n-trials 30 --sampling-steps 1 2 5 \\
@@ -64,8 +67,10 @@ def main(argv: list[str] | None = None) -> None:
     add("--depths", type=int, nargs="+", default=DEPTHS, metavar="N", help="network depths (default: 2 4 8)")
     add("--temperatures", type=float, nargs="+", default=TEMPERATURES, metavar="T", help="default: 0 0.1 0.3 0.6 0.8 1")
     add("--sampling-steps", type=int, nargs="+", metavar="N", help="denoising steps (default: as the run's)")
+    add("--choice-factors", type=float, nargs="+", metavar="BETA", help="how much the critics' scores weigh among the "
+        "candidates; without effect at temperature 0 (default: as the run's)")  # fmt: skip
     add("--sampler", choices=("grid", "tpe"), default="grid", help="grid tries every cell once; tpe draws temperatures "
-        "between the lowest and the highest (default: grid)")  # fmt: skip
+        "and choice factors between the lowest and the highest (default: grid)")  # fmt: skip
     add("--n-trials", type=int, help="trials of the whole study (default: as many as the grid has)")
     add("--gradient-steps", type=int, help="updates of each planner (default: as the run's)")
     add("--episodes", type=int, default=20, help="episodes of a trial (default: 20)")
@@ -98,7 +103,7 @@ def check(args: argparse.Namespace) -> None:
     check_positive(args, "episodes", "round", "report_episodes", "n_trials", "gradient_steps")
     if not 0 <= args.prune < 1:
         raise ValueError(f"--prune is a p-value in [0, 1), got {args.prune}; 0 prunes nothing.")
-    for name in ("depths", "temperatures", "sampling_steps"):
+    for name in ("depths", "temperatures", "sampling_steps", "choice_factors"):
         values = getattr(args, name) or []
         if len(set(values)) < len(values):
             option = name.replace("_", "-")
@@ -122,6 +127,7 @@ def tune(args: argparse.Namespace) -> None:
     planners = DepthPlanners(model, args.run / CHECKPOINT_NAME, folder, args.gradient_steps, args.progress)
     steps = args.sampling_steps or [planners.config.sampling_steps]
     tried = {"depth": args.depths, "temperature": args.temperatures, "sampling_steps": steps}
+    tried |= {"choice_factor": args.choice_factors} if args.choice_factors else {}
     for name, values in tried.items():
         for value in values:
             replace(planners.config, **{name: value})  # raises for a value out of range
@@ -130,7 +136,7 @@ def tune(args: argparse.Namespace) -> None:
     common |= {**planners.config.to_dict(), **planners.training(planners.config.depth)}
     common = {key: value for key, value in common.items() if key not in tried}
     if args.sampler == "tpe":
-        common |= {**tried, "temperature": [min(args.temperatures), max(args.temperatures)]}
+        common |= tried | {name: [min(tried[name]), max(tried[name])] for name in DRAWN if name in tried}
     storage, name = args.storage or str(folder / "study.log"), args.study_name or args.run.resolve().name
     study = open_study(folder, storage, name, common, args.prune)
     print(
@@ -205,7 +211,8 @@ def report(args: argparse.Namespace, run: LoadedRun, study: Study, winner: Froze
     if find_spec("matplotlib") is None:
         print('No plot: it needs matplotlib, pip install "sb3_said[plots]"')
     else:
-        save_plot(study, folder / "slice.png")
+        title = f"{run.info['env']}, delay {run.info['delay']}: mean of {args.episodes} episodes, by setting"
+        save_plot(study, folder / "slice.png", title)
     print(f"Wrote results.json, best.yml and best.zip in {folder}\nTrain with it: {command}")
 
 

@@ -32,6 +32,15 @@ def test_variants_take_turns_in_both_orders_and_are_timed_apart(clock):
     assert {name: t.tolist() for name, t in times.items()} == {"slow": [2.0] * 4, "fast": [0.5] * 4}
 
 
+def test_a_long_measurement_shows_how_far_it_is(monkeypatch, capsys):
+    measure.turn_by_turn({"quick": lambda: None}, rounds=5)
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(measure, "PATIENCE", 0.0)
+    measure.turn_by_turn({"slow": lambda: None}, rounds=5)
+    shown = capsys.readouterr()
+    assert "0/5" in shown.err and shown.out == ""
+
+
 def test_ratio_is_the_median_of_the_turns():
     slow, fast = np.array([2.0, 4.0, 9.0, 8.0, 6.0]), np.array([1.0, 1.0, 3.0, 4.0, 3.0])
     found = measure.ratio(slow, fast)

@@ -9,6 +9,8 @@ import pytest
 import torch as th
 from torch.utils.flop_counter import FlopCounterMode
 
+from sb3_said.planner import PlannerConfig
+
 SETTING = plan_latency.QUICK._replace(config=replace(plan_latency.QUICK.config, depth=2, precision="float32"))
 OBS, ACT = 11, 3  # Hopper-v5
 
@@ -53,7 +55,10 @@ def test_flops_grow_with_each_size():
     base = plan_latency.matmul_flops(SETTING, OBS, ACT)
     twice = plan_latency.matmul_flops(changed(SETTING, n_candidates=2 * SETTING.n_candidates), OBS, ACT)
     assert twice == 2 * base
-    paper = plan_latency.SETTINGS[0]
+    paper, two_steps = plan_latency.SETTINGS[:2]
+    assert (paper.name, paper.config) == ("paper", PlannerConfig.paper())
+    assert (two_steps.name, two_steps.delay, two_steps.n_candidates) == ("paper, 2 steps", 8, 50)
+    assert two_steps.config == PlannerConfig.paper(sampling_steps=2)
     assert plan_latency.matmul_flops(paper, OBS, ACT) == pytest.approx(203.8e9, rel=0.001)
     assert plan_latency.matmul_flops(changed(paper, scored_states="future"), OBS, ACT) < 203.8e9
 

@@ -10,7 +10,15 @@ from hypothesis import strategies as st
 from logged_task import LoggedTask, delay_of_episode
 from random_processes import processes
 
-from sb3_said.delays import WIFI_20MS, DelayedObservationWrapper, FixedDelay, HeldDelay, TotalDelay, UniformDelay
+from sb3_said.delays import (
+    WIFI_20MS,
+    DelayedObservationWrapper,
+    FixedDelay,
+    HeldDelay,
+    TotalDelay,
+    UniformDelay,
+    scale_action,
+)
 from sb3_said.delays.receivers import RECEIVERS
 
 
@@ -96,13 +104,13 @@ def test_actions_that_take_a_time_each(observation, action, receiver, spare, see
             for key, value in twin.step(sent[-1])[0].items():
                 np.testing.assert_array_equal(value, obs[key])  # one process says the same as two
             np.testing.assert_array_equal(task.actions[-1][-1], sent[arrived_as[-1]])
-            np.testing.assert_allclose(env._scale(task.actions[-1][-1]), info["executed_action"])
+            np.testing.assert_allclose(scale_action(task.actions[-1][-1], env.action_space), info["executed_action"])
             shown = t - back.step()
             np.testing.assert_array_equal(obs["observation"], task.states[-1][shown])
             newest = arrived_as[shown - 1] if shown > 0 else -1  # that shows in the observation
             assert obs["delay"].item() == t - 1 - newest <= process.max_delay
             n_sent = min(t, max_delay)
-            newest_sent = np.reshape([env._scale(a) for a in sent[t - n_sent :]], (n_sent, 2))
+            newest_sent = np.reshape([scale_action(a, env.action_space) for a in sent[t - n_sent :]], (n_sent, 2))
             np.testing.assert_allclose(obs["action_history"][max_delay - n_sent :], newest_sent)
             assert not obs["action_history"][: max_delay - n_sent].any()
             assert info["forced_deliveries"] == there.forced_deliveries + back.forced_deliveries

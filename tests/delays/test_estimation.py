@@ -151,6 +151,22 @@ def test_actions_of_no_effect_give_no_confidence():
     assert np.median(confidences) < 0.5 and max(confidences) < 0.95
 
 
+@pytest.mark.parametrize("gains", [(0.3, 1.0), (1.0, 0.5), (0.1, 0.2)])
+@pytest.mark.parametrize(("n", "length"), [(10, 60), (5, 200), (1, 500)])
+def test_actions_that_follow_from_the_observations_give_no_confidence(gains, n, length):
+    """A log without noise of a linear policy: nothing is left for the action to explain, at whatever age."""
+    rng, episodes = np.random.default_rng(0), []
+    for _ in range(n):
+        states, actions = np.zeros((length + 1, 2)), np.zeros((length, 1))
+        states[0] = rng.normal(size=2)
+        for t in range(length):
+            actions[t] = -np.dot(gains, states[t])
+            states[t + 1] = np.array([[1, 0.05], [-0.2, 0.95]]) @ states[t] + np.array([0, 0.05]) * actions[t]
+        episodes.append((states, actions))
+    found = estimate_delay(*zip(*episodes, strict=True))
+    assert found.scores.max() < 2e-3 and found.confidence < 0.5
+
+
 def test_short_logs_of_unrelated_data_are_not_certain():
     rng = np.random.default_rng(0)
     logs = [(rng.normal(size=(54, 1)), rng.normal(size=(53, 1))) for _ in range(60)]

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from counting_task import OBS_DIM, CountingTask
 from gymnasium import spaces
+from gymnasium.wrappers import FlattenObservation, TransformAction
 from small_task import Drift, LateDelay, OwnDelay, delayed
 from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_said.delays import DelayedObservationWrapper, TotalDelay
+from sb3_said.delays import DelayedObservationWrapper, TotalDelay, scale_action, unscale_action
 from sb3_said.delays.space import ages_of, check_spaces, has_state_history, written_ages
 
 
@@ -20,15 +22,74 @@ from sb3_said.delays.space import ages_of, check_spaces, has_state_history, writ
         (spaces.Discrete(3), spaces.Box(-1, 1, (2,)), "FlattenObservation"),
         (spaces.Dict(observation=spaces.Box(-1, 1, (3,))), spaces.Box(-1, 1, (2,)), "wrap the task"),
         (spaces.Box(-1, 1, (3,)), spaces.Box(-1, -1, (2,)), "low and high are equal"),
-        (spaces.Box(-1, 1, (3,)), spaces.Discrete(2), "1-D Box action with finite bounds"),
-        (spaces.Box(-1, 1, (3,)), spaces.Box(-1, np.inf, (2,)), "1-D Box action with finite bounds"),
-        (spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (2, 2)), "1-D Box action with finite bounds"),
+        (spaces.Sequence(spaces.Discrete(3)), spaces.Box(-1, 1, (2,)), "of a fixed length"),
+        (spaces.Box(-1, 1, (3,)), spaces.Discrete(2), "finite bounds.*are not supported"),
+        (spaces.Box(-1, 1, (3,)), spaces.Box(-1, np.inf, (2,)), "finite bounds.*TransformAction"),
+        (spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (2, 2)), "finite bounds.*TransformAction"),
     ],
 )
 def test_other_spaces_are_refused_with_a_reason(observation_space, action_space, reason):
     with pytest.raises(ValueError, match=reason) as refused:
         check_spaces(observation_space, action_space)
     assert "RescaleAction" not in str(refused.value)  # which needs finite bounds itself
+
+
+@pytest.mark.parametrize(
+    "space", [spaces.Discrete(3), spaces.Box(-1, 1, ()), spaces.Box(0, 255, (2, 2, 3), np.uint8),
+              spaces.Dict(a=spaces.Box(-1, 1, (3,)), b=spaces.Discrete(2))], ids=str
+)  # fmt: skip
+def test_an_observation_is_served_once_it_is_flattened(space):
+    task = CountingTask(itertools.count(), max_length=3)
+    task.observation_space, task._new_state = space, space.sample
+    env = DelayedObservationWrapper(FlattenObservation(task), 1)
+    obs, _ = env.reset(seed=0)
+    assert env.observation_space.contains(obs) and env.observation_space.contains(
+        env.step(env.action_space.sample())[0]
+    )
+
+
+@pytest.mark.parametrize("space", [spaces.Box(-np.inf, np.inf, (2,)), spaces.Box(-1, 1, (1, 2))], ids=str)
+def test_an_action_is_served_once_it_is_transformed(space):
+    task = CountingTask(itertools.count(), max_length=3)
+    task.action_space = space
+    flat = TransformAction(task, lambda action: action.reshape(space.shape), spaces.Box(-1, 1, (2,)))
+    env = DelayedObservationWrapper(flat, 1)
+    env.reset(seed=0)
+    action = env.action_space.sample()
+    np.testing.assert_array_equal(env.step(action)[0]["action_history"], [action])
+
+
+BOUNDS = [
+    ([-2, 0], [2, 8], np.float32),
+    ([-1, -1], [1, 1], np.float32),
+    ([-0.4, 0.1], [0.4, 0.3], np.float64),
+    ([-3e38, -3e38], [3e38, 3e38], np.float32),
+]
+
+
+@pytest.mark.parametrize(("low", "high", "dtype"), BOUNDS)
+def test_scaled_actions_go_to_one_and_back(low, high, dtype):
+    space = spaces.Box(np.array(low, dtype), np.array(high, dtype), dtype=dtype)
+    ends = np.stack([space.low, space.high])
+    np.testing.assert_allclose(scale_action(ends, space), [[-1, -1], [1, 1]], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(unscale_action(np.array([[-1, -1], [1, 1]]), space), ends, rtol=1e-15)
+    np.testing.assert_allclose(unscale_action(np.array([-7.0, 7.0]), space), [space.low[0], space.high[1]], rtol=1e-15)
+    space.seed(0)
+    actions = np.stack([space.sample() for _ in range(100)])
+    back = unscale_action(scale_action(actions, space), space)
+    assert back.dtype == space.dtype and all(space.contains(action) for action in back)
+    assert np.all(np.abs(back.astype(float) - actions) <= 1e-7 * (space.high.astype(float) - space.low))
+
+
+@pytest.mark.parametrize(("low", "high", "dtype"), BOUNDS[:3])
+def test_actions_are_scaled_as_by_sb3(low, high, dtype):
+    space = spaces.Box(np.array(low, dtype), np.array(high, dtype), dtype=dtype)
+    policy = SACPolicy(spaces.Box(-1, 1, (3,)), space, lambda _: 1e-3, net_arch=[4])
+    space.seed(1)
+    actions = np.stack([space.sample() for _ in range(100)])
+    np.testing.assert_allclose(scale_action(actions, space), policy.scale_action(actions), atol=1e-5)
+    scaled = scale_action(actions, space)
+    np.testing.assert_allclose(unscale_action(scaled, space), policy.unscale_action(scaled), rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize(("delay", "max_delay"), [(0, 0), (3, 3), ((1, 2), 2)])

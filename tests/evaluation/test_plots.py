@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from sb3_said.evaluation import Summary, plots
+from sb3_said.evaluation import Summary, confidence_interval, plots
 
 PNG = b"\x89PNG"
 
@@ -61,20 +62,18 @@ def test_returns_of_planner_and_expert(png: Path) -> None:
 
 
 def test_return_over_delay(png: Path) -> None:
-    def summary(*returns: float) -> Summary:
-        return Summary.from_episodes("", returns, [1] * len(returns))
-
-    table: dict[str, dict[int | str, Summary]] = {
-        "any": {"WIFI_20MS": summary(3.0, 5.0), 8: summary(1.0, 3.0), 0: summary(10.0)},
-        "short": {0: summary(7.0, 9.0), "RandomWalkDelay(0, 16, move_prob=0.1)": summary(-6.0, -6.0)},
+    table: dict[str, dict[int | str, Any]] = {
+        "any": {"WIFI_20MS": [[3.0, 3.5], [5.0, 4.5]], 8: [1.0, 3.0], 0: [10.0]},
+        "short": {0: [7.0, 9.0], "RandomWalkDelay(0, 16, move_prob=0.1)": [-6.0, -6.0]},
     }
-    fixed, random = plots.plot_over_delays(table)
+    fixed, random = plots.plot_over_delays(table, "Hopper-v5 under delay")
+    assert fixed.figure.get_suptitle() == "Hopper-v5 under delay"
     lines = [container.lines[0].get_xydata().tolist() for container in fixed.containers]
     assert lines == [[[0.0, 10.0], [8.0, 2.0]], [[0.0, 8.0]]]  # in the order of delays, whatever that of the table
     points = [container.lines[0].get_xydata() for container in random.containers]
     assert [np.round(p[:, 0]).tolist() for p in points] == [[0.0], [1.0]]  # under the tick of their delay
     assert [p[:, 1].tolist() for p in points] == [[4.0], [-6.0]]
-    interval = table["any"]["WIFI_20MS"].mean_return
+    interval = confidence_interval(table["any"]["WIFI_20MS"])  # of two training seeds
     (bar,) = random.containers[0].lines[2][0].get_segments()
     np.testing.assert_allclose(bar[:, 1], [interval.low, interval.high])
     labels = [label.get_text() for label in random.get_xticklabels()]
@@ -83,6 +82,9 @@ def test_return_over_delay(png: Path) -> None:
     assert fixed.get_ylim()[0] < -6.0 and fixed.get_ylim()[1] > 10.0  # markers of either panel are inside both
     plots.save(fixed, png)
     assert drawn(png)
+    for n in (4, 7, 8, 20):
+        (ax,) = plots.plot_over_delays({f"agent {i}": {0: [1.0, 2.0]} for i in range(n)})
+        assert len({container.lines[0].get_color() for container in ax.containers}) == n
     only_fixed = {agent: {d: s for d, s in row.items() if isinstance(d, int)} for agent, row in table.items()}
     assert len(plots.plot_over_delays(only_fixed)) == 1
     with pytest.raises(ValueError, match="Nothing was played"):
@@ -106,7 +108,7 @@ def test_planner_errors(tmp_path: Path, png: Path) -> None:
     assert len(plots.plot_planner_errors(tmp_path, "present", left).lines) == 2
     plots.plot_planner_errors(tmp_path, "action", right)
     np.testing.assert_array_equal(right.lines[0].get_xydata(), [[100, 0.4], [200, 0.3], [300, 0.2], [400, 0.15]])
-    assert [line.get_label() for line in right.lines] == ["planner, d = 4", "MLP, d = 4"]
+    assert [line.get_label() for line in right.lines] == ["planner, delay 4", "MLP, delay 4"]
     plots.save(left, png)
     assert drawn(png)
     (tmp_path / "progress_500.csv").unlink()
@@ -121,7 +123,7 @@ def test_errors_of_many_delays_are_thinned(tmp_path: Path) -> None:
         ",".join(["planner/n_updates", *names]) + "\n" + ",".join(["100"] + ["0.5"] * 34)
     )
     lines = plots.plot_planner_errors(tmp_path, "present").lines
-    assert [line.get_label() for line in lines[::2]] == [f"planner, d = {d}" for d in (0, 4, 8, 12, 16)]
+    assert [line.get_label() for line in lines[::2]] == [f"planner, delay {d}" for d in (0, 4, 8, 12, 16)]
     assert len({line.get_color() for line in lines}) == 5
 
 

@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import ttest_1samp
 
-from sb3_said.evaluation import Latency, Summary, bootstrap_interval, iqm
+from sb3_said.evaluation import Latency, Summary, confidence_interval, iqm
 
 
 @pytest.mark.parametrize("statistic", [np.mean, np.median, iqm])
-@pytest.mark.parametrize("n", [5, 20, 100])
+@pytest.mark.parametrize("n", [10, 20, 100])
 def test_interval_of_skewed_values(statistic, n: int) -> None:
     sample = np.random.default_rng(n).exponential(size=n) ** 2
-    found = bootstrap_interval(sample, statistic)
-    assert found.value == pytest.approx(statistic(sample)) and (found.n, found.confidence) == (n, 0.95)
+    found = confidence_interval(sample, statistic)
+    assert found.value == pytest.approx(statistic(sample))
+    assert (found.n, found.confidence, found.method) == (n, 0.95, "BCa bootstrap")
     assert sample.min() <= found.low < found.value < found.high <= sample.max()
     # In exact powers of two, so that ties among resamples stay ties.
-    scaled, turned = (bootstrap_interval(factor * sample, statistic) for factor in (4.0, -2.0))
+    scaled, turned = (confidence_interval(factor * sample, statistic) for factor in (4.0, -2.0))
     np.testing.assert_allclose(
         [scaled.low, scaled.value, scaled.high], [4 * found.low, 4 * found.value, 4 * found.high]
     )
@@ -32,7 +37,7 @@ def test_bca_corrects_for_skew() -> None:
     sample = np.random.default_rng(20).exponential(size=20) ** 2
     draws = np.random.default_rng(1).choice(sample, (20_000, 20)).mean(1)
     low, high = np.quantile(draws, [0.025, 0.975])
-    found = bootstrap_interval(sample)
+    found = confidence_interval(sample)
     assert found.low > low and found.high > high + 0.02 * (high - low)
 
 
@@ -40,42 +45,98 @@ def test_interval_covers_the_true_mean_as_often_as_it_says() -> None:
     rng = np.random.default_rng(0)
     hits = []
     for _ in range(400):
-        interval = bootstrap_interval(rng.exponential(size=20), n_resamples=1000)
+        interval = confidence_interval(rng.exponential(size=20), n_resamples=1000)
         hits.append(interval.low <= 1.0 <= interval.high)
     assert 0.88 <= np.mean(hits) <= 0.98  # BCa is a little short of 95 % at n = 20
 
 
-def test_interval_repeats_and_contains_its_value() -> None:
-    sample = np.random.default_rng(3).normal(size=12)
-    first, second = bootstrap_interval(sample), bootstrap_interval(sample)
+@pytest.mark.parametrize("n", [2, 3, 5, 9])
+def test_few_values_have_the_t_interval_of_their_mean(n: int) -> None:
+    sample = np.random.default_rng(n).normal(1000.0, 300.0, n)
+    expected = ttest_1samp(sample, 0.0).confidence_interval(0.9)
+    found = confidence_interval(sample, confidence=0.9)
+    assert (found.low, found.high) == pytest.approx((expected.low, expected.high))
+    assert found.method == "Student's t"
+
+
+def test_seeds_are_the_units_whatever_their_episodes() -> None:
+    """Three seeds: the interval of their means. Twelve: their episodes are drawn together."""
+    rng = np.random.default_rng(0)
+    returns = rng.normal(size=(3, 1)) + rng.normal(size=(3, 20))
+    found, of_means = confidence_interval(returns), confidence_interval(returns.mean(1))
+    assert (found.value, found.low, found.high) == pytest.approx((of_means.value, of_means.low, of_means.high))
+    assert found.n == 3
+    assert confidence_interval(returns, iqm).value == pytest.approx(iqm(returns.ravel()))
+    many = 3 * rng.normal(size=(12, 1)) + rng.normal(size=(12, 20))
+    by_seed, as_if_alone = confidence_interval(many), confidence_interval(many.ravel())
+    of_means = confidence_interval(many.mean(1))
+    assert (by_seed.low, by_seed.high) == pytest.approx((of_means.low, of_means.high), rel=1e-3)
+    assert by_seed.method == "BCa bootstrap"
+    assert by_seed.high - by_seed.low > 2 * (as_if_alone.high - as_if_alone.low)
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    n=st.integers(2, 5),
+    m=st.integers(1, 4),
+    spread=st.sampled_from([0.0, 1e-5, 1.0, 300.0]),
+    statistic=st.sampled_from([np.mean, np.median, iqm]),
+    seed=st.integers(0, 1000),
+)
+def test_few_values_that_hardly_change_have_the_same_interval(n, m, spread, statistic, seed) -> None:
+    rng = np.random.default_rng(seed)
+    sample = rng.choice([-700.0, -766.0, 1000.0], (n, m)) + spread * rng.normal(size=(n, m))
+    tiny = 1e-5 * rng.uniform(-1, 1, (n, m))
+    before, after = confidence_interval(sample, statistic), confidence_interval(sample + tiny, statistic)
+    # No unit moves a statistic by more than its values move; t is 12.7 at one degree of freedom.
+    assert abs(after.value - before.value) <= 1e-5
+    assert abs(after.low - before.low) <= 1e-3 and abs(after.high - before.high) <= 1e-3
+
+
+@pytest.mark.parametrize("n", [3, 5])
+def test_intervals_over_few_seeds_cover_the_mean_of_normal_returns(n: int) -> None:
+    """Episodes within seeds, seeds within the algorithm: 95 % of the intervals hold the algorithm's mean."""
+    rng = np.random.default_rng(n)
+    hits = []
+    for _ in range(1500):
+        returns = 5.0 + 2.0 * rng.normal(size=(n, 1)) + rng.normal(size=(n, 10))
+        interval = confidence_interval(returns)
+        hits.append(interval.low <= 5.0 <= interval.high)
+    assert 0.93 <= np.mean(hits) <= 0.97  # the standard error is 0.006
+
+
+@pytest.mark.parametrize("n", [3, 12])
+def test_interval_repeats_and_contains_its_value(n: int) -> None:
+    sample = np.random.default_rng(3).normal(size=n)
+    first, second = confidence_interval(sample), confidence_interval(sample)
     assert first == second and first.low < first.value < first.high
-    wider = bootstrap_interval(sample, confidence=0.99)
+    wider = confidence_interval(sample, confidence=0.99)
     assert wider.low < first.low and first.high < wider.high
 
 
 @pytest.mark.filterwarnings("error")
 def test_interval_of_constant_and_single_values() -> None:
     for statistic in (np.mean, iqm):
-        constant = bootstrap_interval([0.1] * 7, statistic)
+        constant = confidence_interval([0.1] * 7, statistic)
         assert (constant.value, constant.low, constant.high) == pytest.approx((0.1, 0.1, 0.1), abs=1e-15)
-    one = bootstrap_interval([3.0])
+    one = confidence_interval([3.0])
     assert one.value == 3.0 and np.isnan(one.low) and np.isnan(one.high)
 
 
 @pytest.mark.filterwarnings("error")
 def test_interval_where_no_single_value_matters() -> None:
-    found = bootstrap_interval([1.0, 1.0, 1.0, 1.0, 5.0], np.median)
-    assert (found.value, found.low, found.high) == (1.0, 1.0, 5.0)
-    successes = bootstrap_interval([1000.0] * 9 + [990.0], iqm)
+    found = confidence_interval([1.0] * 7 + [5.0] * 4, np.median)
+    assert (found.value, found.low, found.high, found.method) == (1.0, 1.0, 5.0, "percentile bootstrap")
+    successes = confidence_interval([1000.0] * 9 + [990.0], iqm)
     assert 990.0 < successes.low < successes.value == successes.high == 1000.0
 
 
-@pytest.mark.parametrize("values", [[], [1.0, np.nan], [np.inf]])
-def test_interval_refuses_what_has_no_mean(values: list[float]) -> None:
+@pytest.mark.parametrize("values", [[], [[], []], [1.0, np.nan], [np.inf]])
+def test_interval_refuses_what_has_no_mean(values: list[Any]) -> None:
     with pytest.raises(ValueError, match="finite"):
-        bootstrap_interval(values)
+        confidence_interval(values)
     with pytest.raises(ValueError, match="confidence"):
-        bootstrap_interval([1.0, 2.0], confidence=95)
+        confidence_interval([1.0, 2.0], confidence=95)
 
 
 def test_iqm_drops_a_quarter_at_each_end() -> None:
@@ -94,5 +155,12 @@ def test_latency_percentiles_are_ordered() -> None:
 def test_summary_is_strict_json() -> None:
     summary = Summary.from_episodes("planner", [5.0], [7], Latency.from_seconds([0.001]))
     read = json.loads(json.dumps(summary.to_dict(), allow_nan=False))
-    assert read["mean_return"] == {"value": 5.0, "low": None, "high": None, "confidence": 0.95, "n": 1}
+    assert read["mean_return"] == {
+        "value": 5.0,
+        "low": None,
+        "high": None,
+        "confidence": 0.95,
+        "n": 1,
+        "method": "none",
+    }
     assert read["returns"] == [5.0] and read["lengths"] == [7] and read["latency"]["n_calls"] == 1

@@ -163,9 +163,9 @@ def test_optimizers_follow_the_schedule():
 
 def test_planner_holds_the_average_of_the_online_weights():
     trainer = make_trainer(ema_decay=0.3)
-    naive = [parameter.detach().clone() for parameter in trainer.planner.parameters()]
+    naive = [parameter.detach().clone() for parameter in trainer.average.parameters()]
     for step in range(6):
-        trainer.step()
+        assert trainer.train(1)
         decay = min(0.3, (1 + step) / (10 + step))
         assert ema_decay(step, trainer.config) == decay
         for mean, parameter in zip(naive, trainer.online.parameters(), strict=True):
@@ -430,8 +430,8 @@ def test_evaluation_sees_no_future_action():
     """Errors are those of an agent: whatever is unknown at the decision may be anything."""
     trainer = make_trainer()
     with pytest.MonkeyPatch.context() as patch:
-        given, plan = [], trainer.planner.plan
-        patch.setattr(trainer.planner, "plan", lambda *batch, **rest: given.append(batch[1]) or plan(*batch, **rest))
+        given, plan = [], trainer.average.plan
+        patch.setattr(trainer.average, "plan", lambda *batch, **rest: given.append(batch[1]) or plan(*batch, **rest))
         trainer.evaluate()
     for (d, windows), history in zip(trainer._held_out.items(), given, strict=True):
         delay = th.full((len(windows.states),), d)
@@ -475,11 +475,55 @@ def test_infinite_loss_names_its_update(monkeypatch):
         return loss(*args, **kwargs) * (math.nan if trainer.n_updates >= 3 else 1.0)
 
     monkeypatch.setattr(trainer.online, "loss", breaks)
-    with pytest.raises(FloatingPointError, match=r"update 3 \(of 200\)"):
+    with pytest.raises(FloatingPointError, match=r"Update 3 \(of 200\)"):
         trainer.train()
     assert trainer.n_updates == 100  # looked at rarely, to keep a GPU busy
     with pytest.raises(FloatingPointError):
         trainer.state_dict()
+
+
+@pytest.mark.parametrize("is_last", [False, True])
+def test_no_bad_update_reaches_the_planner(monkeypatch, is_last):
+    """Not even one whose loss was finite and whose gradient was not, and which no other loss follows."""
+    trainer = make_trainer(gradient_steps=5)
+    before, loss = copy.deepcopy(trainer.planner.state_dict()), trainer.online.loss
+
+    def breaks(*args, **kwargs):
+        zero = 0.0 * next(trainer.online.parameters()).sum()
+        return loss(*args, **kwargs) + (zero.sqrt() if trainer.n_updates == (4 if is_last else 2) else zero)
+
+    monkeypatch.setattr(trainer.online, "loss", breaks)
+    with pytest.raises(FloatingPointError, match="of 5"):
+        trainer.train()
+    assert_same(dict(trainer.planner.state_dict()), dict(before))
+    with pytest.raises(FloatingPointError):
+        trainer.hand_over()
+    assert_same(dict(trainer.planner.state_dict()), dict(before))
+
+
+def test_the_planner_stays_as_it_is_until_a_training_hands_over():
+    trainer = make_trainer()
+    before = copy.deepcopy(trainer.planner.state_dict())
+    trainer.hand_over()  # nothing was trained
+    trainer.step()
+    trainer.evaluate()
+    assert_same(dict(trainer.planner.state_dict()), dict(before))
+    trainer.train(callback=lambda t: t.n_updates < 3)
+    assert_same(dict(trainer.planner.state_dict()), dict(trainer.average.state_dict()))
+    assert not th.equal(trainer.planner.normalizer.state_mean, before["normalizer.state_mean"])
+
+
+def test_every_training_starts_anew():
+    """Old weights would read new data through another normaliser."""
+    source = make_source(40, 20)
+    whole, other = make_trainer(source=source), make_trainer(source=source)
+    whole.train()
+    other.train()
+    shifted = dataclasses.replace(source, states=3.0 * source.states + 1.0)
+    PlannerTrainer(other.planner, shifted, 12, 0.1, seed=5).train()
+    assert not th.equal(other.planner.normalizer.state_mean, whole.planner.normalizer.state_mean)
+    PlannerTrainer(other.planner, source, 12, 0.1, seed=0).train()
+    assert_same(dict(other.planner.state_dict()), dict(whole.planner.state_dict()))
 
 
 @pytest.mark.parametrize("arguments", [{"gradient_steps": 0}, {"held_out": 1.0}, {"held_out": -0.1}])

@@ -84,12 +84,22 @@ def test_the_range_is_from_the_lowest_to_the_highest():
     assert scaled_values(th.full((4,), -7.0), "range").tolist() == [1.0] * 4
 
 
+def test_the_centred_range_counts_beta_twice():
+    """The code under the paper's results maps values to [-1, 1], so that its weights run from exp(-2 beta) to 1."""
+    values = th.tensor([-5.0, 0.0, 15.0])
+    np.testing.assert_allclose(scaled_values(values, "centred"), [-1, -0.5, 1])
+    assert scaled_values(th.full((4,), -7.0), "centred").tolist() == [1.0] * 4
+    weights = window_weight(scaled_values(values, "centred"), 2.0)
+    np.testing.assert_allclose(weights, [math.exp(-4.0), math.exp(-3.0), 1.0], rtol=1e-6)
+    th.testing.assert_close(weights, window_weight(scaled_values(values, "range"), 4.0))
+
+
 @pytest.mark.parametrize("scale", VALUE_SCALES)
 @given(st.lists(st.floats(-(2.0**100), 2.0**100, width=32), min_size=1, max_size=20))
-def test_scaled_values_are_within_zero_and_one_and_in_order(scale, values):
+def test_scaled_values_are_within_their_bounds_and_in_order(scale, values):
     values = th.tensor(values)
     scaled = scaled_values(values, scale)
-    assert scaled.dtype == th.float32 and scaled.min() >= 0 and scaled.max() <= 1
+    assert scaled.dtype == th.float32 and scaled.min() >= (-1 if scale == "centred" else 0) and scaled.max() <= 1
     assert (scaled[values.argsort()].diff() >= 0).all()
 
 

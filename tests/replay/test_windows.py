@@ -163,25 +163,32 @@ def test_a_short_episode_repeats_its_last_row():
 
 @settings(max_examples=80, deadline=None)
 @given(
-    st.lists(st.integers(1, 30), min_size=2, max_size=20), st.sampled_from([0.01, 0.1, 0.5, 0.99]), st.integers(0, 1000)
+    st.lists(st.integers(1, 30), min_size=1, max_size=20).filter(lambda lengths: sum(lengths) > 1),
+    st.sampled_from([0.01, 0.1, 0.5, 0.99]),
+    st.integers(0, 1000),
 )
-def test_split_by_whole_episodes(lengths, held_out, seed):
+def test_split_by_episodes(lengths, held_out, seed):
     source = make_source(lengths)
     training, validation = source.split(held_out, seed)
-    parts = [set(part.episodes.tolist()) for part in (training, validation)]
-    assert parts[0] | parts[1] == set(range(len(lengths))) and not parts[0] & parts[1]
-    assert parts[0] and parts[1]
-    for part, numbers in zip((training, validation), parts, strict=True):
-        assert len(part) == sum(lengths[i] for i in numbers)
+    assert len(validation) == max(1, int(held_out * len(source))) and len(training) + len(validation) == len(source)
+    in_both = set(training.episodes.tolist()) & set(validation.episodes.tolist())
+    assert len(in_both) <= 1  # the rest are whole
+    for part in (training, validation):
         assert part.start_states()[:, 0].tolist() == part.episodes.tolist()  # every column is cut alike
         th.testing.assert_close(part.start_states()[:, 1], part.values * max(lengths))
-        assert th.equal(part.remaining, th.tensor(lengths)[part.episodes] - part.start_states()[:, 1].long())
         assert part.states is source.states  # not copied
-    # As many as asked for, and no episode more than needed; one is always left for training
-    enough = len(validation) >= held_out * len(source)
-    assert enough or len(parts[0]) == 1
-    smallest_surplus = len(validation) - max(lengths[i] for i in parts[1])
-    assert smallest_surplus < held_out * len(source)
+    # No window of one part shows a step of the other, and each shows all steps of its own
+    steps = []
+    for part in (training, validation):
+        windows = part.gather(th.arange(len(part)), max(lengths))
+        steps.append({tuple(step) for step in windows.states[windows.valid].tolist()})
+    assert not steps[0] & steps[1] and len(steps[0] | steps[1]) == len(source)
+
+
+def test_of_two_episodes_no_more_is_held_out_than_asked_for():
+    training, validation = make_source([100, 100]).split(0.05)
+    assert (len(training), len(validation)) == (190, 10)
+    assert validation.start_states()[:, 1].tolist() == [*range(90, 100)]  # the end of one of them
 
 
 def test_split_repeats_with_its_seed():
@@ -190,9 +197,9 @@ def test_split_repeats_with_its_seed():
     assert not th.equal(source.split(0.2, 1)[1].rows, source.split(0.2, 2)[1].rows)
 
 
-def test_split_needs_two_episodes():
-    with pytest.raises(ValueError, match="at least two episodes"):
-        make_source([10]).split(0.1)
+def test_split_needs_two_steps():
+    with pytest.raises(ValueError, match="at least two"):
+        make_source([1]).split(0.1)
 
 
 def test_dimensions_and_starts():

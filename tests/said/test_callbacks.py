@@ -13,6 +13,7 @@ from stable_baselines3.common.logger import KVWriter, Logger
 
 from sb3_said import SAID, DelayedObservationWrapper, PlannerTrainingCallback
 from sb3_said.files.checkpoint import TrainingCheckpointCallback, restore_training
+from sb3_said.planner import InpaintingPlanner
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.said.said import PLANNER_CHECKPOINT_NAME
 
@@ -152,16 +153,45 @@ def test_losses_are_logged_and_a_bar_is_shown(capsys):
     memory = Memory()
     model = make(planner_gradient_steps=5)
     model.set_logger(Logger(None, [memory]))
-    model.learn(45, PlannerTrainingCallback(log_interval=2, eval_interval=4, progress_bar=True), log_interval=None)
+    model.learn(80, PlannerTrainingCallback(log_interval=2, eval_interval=4, progress_bar=True), log_interval=None)
     rows = [row for row in memory.rows if "planner/loss" in row]
     assert [row["planner/n_updates"] for row in rows] == [2, 4, 5]
-    assert [row["step"] for row in rows] == [47, 49, 50]
+    assert [row["step"] for row in rows] == [82, 84, 85]  # nothing comes after, and a curve needs an axis
     assert all(np.isfinite(row["planner/loss"]) and row["planner/loss"] > 0 for row in rows)
     assert ["planner/present_error_d2" in row for row in rows] == [False, True, True]
     shown = capsys.readouterr().err
     assert "planner: 100%" in shown and "5/5" in shown
     make().learn(40, PlannerTrainingCallback())
     assert "planner" not in capsys.readouterr().err
+
+
+def test_rows_of_the_planner_are_its_own_and_in_order():
+    memory = Memory()
+    model = make(planner_train_freq=40)
+    model.set_logger(logger := Logger(None, [memory]))
+    model.learn(100, PlannerTrainingCallback(log_interval=2), log_interval=1)
+    of_planner = [row for row in memory.rows if "planner/loss" in row]
+    of_expert = [row for row in memory.rows if "planner/loss" not in row]
+    assert [row["planner/n_updates"] for row in of_planner] == 3 * [2, 4, 6]
+    assert all(key.startswith("planner/") or key == "step" for row in of_planner for key in row)
+    assert not any(key.startswith("planner/") for row in of_expert for key in row)
+    steps = [row["step"] for row in memory.rows]
+    assert steps == sorted(steps) and len(set(steps)) > 3
+    # What is recorded and not yet written waits for its own row
+    logger.record("mine", 1.0)
+    logger.record_mean("mean", 3.0)
+    model.train_planner()
+    assert logger.name_to_value["mine"] == 1.0 and "mine" not in memory.rows[-1]
+    logger.record_mean("mean", 5.0)
+    assert logger.name_to_value["mean"] == 4.0
+
+
+@pytest.mark.parametrize(("how", "is_told"), [({}, True), ({"progress_bar": True}, False), ({"verbose": 1}, False)])
+def test_a_training_that_shows_nothing_says_that_it_begins(how, is_told, capsys):
+    verbose = how.pop("verbose", 0)
+    make(verbose=verbose).learn(40, PlannerTrainingCallback(**how))
+    told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("Training the planner: 6 updates")]
+    assert len(told) == is_told and all("progress_bar=True" in line for line in told)
 
 
 # ---------------------------------------------------------------------------------------------------- cancelling
@@ -182,11 +212,43 @@ def test_cancelling_early_keeps_the_weights(monkeypatch, capsys):
     assert_same(planner_of(SAID.load(file, device="cpu")), kept)
 
 
-def test_cancelling_before_the_first_update_keeps_an_earlier_planner(monkeypatch):
-    model = make().learn(40)
-    interrupt_at(monkeypatch, 0, KeyboardInterrupt)
+def retrain_on_other_data(model):
+    model.replay_buffer.observations *= 3.0
     model.train_planner()
+
+
+def test_cancelling_before_the_first_update_keeps_an_earlier_planner(monkeypatch, capsys):
+    model = make().learn(40)
+    kept = planner_of(model)
+    interrupt_at(monkeypatch, 0, KeyboardInterrupt)
+    retrain_on_other_data(model)
+    assert "stays as it was" in capsys.readouterr().out
     assert model.policy.planner_is_trained and model.policy.planner_updates == 6
+    assert_same(planner_of(model), kept)  # its normaliser, too
+
+
+@pytest.mark.parametrize("is_trained", [False, True])
+def test_a_training_that_diverges_leaves_the_planner_as_it_was(monkeypatch, is_trained):
+    model = make()
+    if is_trained:
+        model.learn(40)
+    kept, loss = planner_of(model), InpaintingPlanner.loss
+
+    def breaks(*args, **kwargs):
+        return loss(*args, **kwargs) * np.nan
+
+    monkeypatch.setattr(InpaintingPlanner, "loss", breaks)
+    with pytest.raises(FloatingPointError, match="stays as it was"):
+        retrain_on_other_data(model) if is_trained else model.learn(40)
+    assert_same(planner_of(model), kept)
+    assert model.policy.who_answers == ("planner" if is_trained else "expert")
+    assert np.isfinite(model.predict(model.env.reset(), deterministic=True)[0]).all()
+
+
+def test_every_training_starts_anew():
+    """A second training ends as if there had been no first, on the replay as it then is."""
+    often, once = make(planner_train_freq=40).learn(100), make().learn(100)
+    assert_same(planner_of(often), planner_of(once))
 
 
 def test_cancelling_one_of_several_trainings_does_not_end_learning(monkeypatch, trainings):

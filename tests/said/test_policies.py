@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from small_agent import answer, make, observe, rows_of, same_replay
 from small_task import Drift, delayed
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -20,6 +22,31 @@ def test_value_is_the_smallest_critic(trained):
     expected = th.minimum(*critics).reshape(3, 4, 5)
     assert not th.equal(critics[0], critics[1])
     th.testing.assert_close(policy.value(states, actions), expected)
+
+
+class Scaled(FlattenExtractor):
+    """Computes otherwise in training mode than in use."""
+
+    def __init__(self, observation_space, layer):
+        super().__init__(observation_space)
+        self.layer = layer(2) if layer is th.nn.BatchNorm1d else layer(0.5)
+
+    def forward(self, observations):
+        return self.layer(super().forward(observations))
+
+
+@pytest.mark.parametrize("layer", [th.nn.BatchNorm1d, th.nn.Dropout])
+def test_values_are_those_of_critics_in_use(layer):
+    """A planner's windows end in a batch of one value, which BatchNorm cannot train on."""
+    extractor = {"features_extractor_class": Scaled, "features_extractor_kwargs": {"layer": layer}}
+    model = make(Drift(length=1000), policy_kwargs={"net_arch": [32], **extractor}).learn(40)
+    assert model.policy.planner_is_trained
+    states, actions = th.randn(3, 4, 2), th.zeros(3, 4, 1)
+    model.policy.set_training_mode(True)
+    batch = model.policy.value(states, actions)
+    model.policy.set_training_mode(True)
+    rows = [model.policy.value(states[i : i + 1, :1], actions[i : i + 1, :1])[0] for i in range(3)]
+    th.testing.assert_close(batch[:, :1], th.stack(rows))
 
 
 @pytest.mark.parametrize("delay", [0, 1, 2])
@@ -139,6 +166,52 @@ def test_bad_observations_are_refused_before_planning(trained, key, value, messa
     obs = rows_of(observe())[3] | {key: np.asarray(value, np.float32)}
     with pytest.raises(ValueError, match=message):
         trained.predict(obs, deterministic=deterministic)
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+@pytest.mark.parametrize("temperature", [0.0, 0.5])
+@pytest.mark.parametrize("who", ["planner", "expert"])
+def test_what_no_network_can_answer_is_refused(saved, who, temperature, deterministic):
+    model, batch = SAID.load(saved, device="cpu"), observe()
+    model.set_planner(temperature=temperature)
+    batch["observation"][3] = 1e30
+    with model.policy.answering(who):
+        if who == "expert":  # its tanh saturates
+            assert np.abs(answer(model, batch, deterministic)).max() == 2.0
+        else:
+            with pytest.raises(ValueError, match=r"1e\+30"):
+                answer(model, batch, deterministic)
+
+
+@pytest.mark.parametrize("who", ["planner", "expert"])
+def test_no_action_of_broken_networks_is_returned(saved, who):
+    model, batch = SAID.load(saved, device="cpu"), observe()
+    model.set_planner(temperature=0.0)
+    network = model.policy.planner.network if who == "planner" else model.policy.actor
+    for parameter in network.parameters():
+        parameter.data.fill_(np.nan)
+    with model.policy.answering(who):
+        for ask in (model, model.policy):
+            with pytest.raises(ValueError, match=r"not finite|invalid values"):
+                answer(ask, batch)
+
+
+@pytest.mark.parametrize("who", ["planner", "expert"])
+def test_every_action_is_in_the_action_space(who):
+    """Scaling from [-1, 1] to uneven bounds rounds, here to beyond the upper one."""
+
+    class Uneven(Drift):
+        action_space = spaces.Box(-0.65, 0.46, (1,), np.float32)
+
+    env = DelayedObservationWrapper(Uneven(), 2)
+    model = make(env, planner_kwargs={"temperature": 0.0})
+    assert model.policy.unscale_action(np.ones(1, np.float32)) > np.float32(0.46)  # the rounding that this is about
+    model.policy.planner_updates.fill_(1)
+    model.policy.planner.normalizer.action_mean.fill_(5.0)  # saturates
+    model.policy.actor.mu.bias.data.fill_(50.0)
+    with model.policy.answering(who):
+        (action,) = answer(model, observe(1, env))
+    assert action > 0.45 and model.action_space.contains(action)
 
 
 def test_a_zeros_sign_changes_no_answer(saved):

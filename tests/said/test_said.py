@@ -138,6 +138,22 @@ def test_arguments_that_cannot_work_are_refused(kwargs, message):
         make(**kwargs)
 
 
+@pytest.mark.parametrize(
+    ("cls", "name", "nearest"),
+    [
+        (SAID, "planner_kwarg", "planner_kwargs"),
+        (SAID, "gradient_stpes", "gradient_steps"),
+        (DelayedSAC, "augmented_state", "augment_state"),
+        (DelayedSAC, "tensorboard_logs", "tensorboard_log"),
+    ],
+)
+def test_an_unknown_argument_is_told_the_nearest(cls, name, nearest):
+    with pytest.raises(TypeError, match=rf"^{cls.__name__} has no argument {name}; did you mean {nearest}\?$"):
+        make(cls=cls, **{name: 1})
+    with pytest.raises(TypeError, match=rf"^{cls.__name__} has no argument zzz; it has action_noise, "):
+        make(cls=cls, zzz=1)
+
+
 def test_every_argument_has_a_default_and_is_an_attribute():
     parameters = list(inspect.signature(SAID.__init__).parameters.values())[3:]
     own = [p for p in parameters if p.kind is not p.VAR_KEYWORD]

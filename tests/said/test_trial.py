@@ -1,5 +1,6 @@
 """The trial after the planner's training: it measures what evaluate_policy does, and the better one answers."""
 
+import csv
 import warnings
 
 import gymnasium as gym
@@ -8,6 +9,7 @@ import pytest
 from small_agent import answer, make, observe
 from small_task import delayed
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
@@ -110,3 +112,14 @@ def test_the_same_seed_gives_the_same_trial():
     first, second = returns(), returns()
     for who in first:
         np.testing.assert_array_equal(first[who], second[who])
+
+
+def test_both_returns_are_logged_behind_the_planners_rows(monkeypatch, tmp_path):
+    rigged(monkeypatch, planner=[1.0, 3.0], expert=[1.0, 1.0])
+    model = make(planner_trial_episodes=2).learn(60)
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.logger.record("mine", 7)
+    model.train_planner()
+    rows = list(csv.DictReader((tmp_path / "progress.csv").open()))
+    assert [float(rows[-1][f"trial/{who}_return"]) for who in ("planner", "expert")] == [2.0, 1.0]
+    assert model.logger.name_to_value["mine"] == 7  # for the user's next row

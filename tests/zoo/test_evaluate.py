@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -25,9 +26,17 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_run(tmp_path_factory.mktemp("said") / f"{ENV}-delay2_1", SAID, 2, steps=100)
 
 
-def test_evaluate_measures_the_planner_and_the_expert(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_evaluate_measures_the_planner_and_the_expert(
+    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     pytest.importorskip("matplotlib")
-    plot = run / "plot.png"
+    plot, titles, save = run / "plot.png", [], evaluate.plots.save
+
+    def recorded(ax: Any, path: Path) -> None:
+        titles.append(ax.figure.get_suptitle())
+        save(ax, path)
+
+    monkeypatch.setattr(evaluate.plots, "save", recorded)
     evaluate.main([str(run), "--episodes", "3", "--n-envs", "2", "--latency-calls", "5", "--seed", "7",
                    "--plot", str(plot), "--device", "cpu"])  # fmt: skip
     document = json.loads((run / "evaluation.json").read_text())
@@ -43,7 +52,7 @@ def test_evaluate_measures_the_planner_and_the_expert(run: Path, capsys: pytest.
         assert result["latency"]["n_calls"] == 5
     out = capsys.readouterr().out
     assert all(word in out for word in ("planner", "expert", "p95", "evaluation.json"))
-    assert plot.read_bytes()[:4] == b"\x89PNG"
+    assert plot.read_bytes()[:4] == b"\x89PNG" and titles == [f"said on {ENV}, delay 2"]
 
 
 def test_a_shorter_delay_keeps_the_length_of_the_action_history(run: Path) -> None:

@@ -16,6 +16,7 @@ import yaml
 
 pytest.importorskip("rl_zoo3")
 
+from scipy.stats import ttest_1samp
 from small_run import ENV, write_run
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
@@ -172,6 +173,7 @@ def test_without_runs_what_was_played_is_shown(
         for column, delay in ((1, 1), (2, "UniformDelay(0, 1)")):
             assert row[column].startswith(f"{np.mean(cells[agent, delay]['returns']):.1f} [")
     assert plot.read_bytes()[:4] == b"\x89PNG"
+    assert show("--rows", "one=a short name")[2][0] == "a short name"
     play(file, runs, ["0", "1"], "--rows", "again")
     assert not played  # an agent under two labels is known under both
     assert file.read_bytes() != written and by_cell(json.loads(file.read_text())) == cells
@@ -232,19 +234,60 @@ def test_a_planner_of_one_delay_plays_no_other(said: Path) -> None:
     assert over_delays.obstacle(model, "expert", 1) is None
 
 
+def test_training_seeds_of_one_label_are_one_row(
+    sadr: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They play every delay; the intervals are over the seeds, by Student's t, also when the file is shown again."""
+    pytest.importorskip("matplotlib")
+    seeds = [sadr, *(write_run(tmp_path / f"seed{seed}", DelayedSAC, 1, seed=seed) for seed in (1, 2))]
+    file, plot = tmp_path / "out.json", tmp_path / "plot.png"
+    runs = [f"any={run}" for run in seeds]
+    document = play(file, [*runs, f"one={sadr}"], ["0", "1"])
+    capsys.readouterr()
+    titles: list[str] = []
+    monkeypatch.setattr(over_delays.plots, "save", lambda ax, path: titles.append(ax.figure.get_suptitle()))
+    over_delays.main(["--json", str(file), "--plot", str(plot), "--rows", "any=three seeds", "one"])
+    out = capsys.readouterr().out
+    rows = {
+        line.split("|")[1].strip(): line.split("|")[2:-1]
+        for line in out.splitlines()
+        if line.startswith("| ") and "---" not in line
+    }
+    assert [*rows] == ["return under delay", "three seeds", "one"]
+    returns = {
+        (cell["file"], cell["delay"]): cell["result"]["returns"] for cell in document["cells"] if cell["agent"] == "any"
+    }
+    assert len(returns) == 6
+    for column, delays in enumerate([(0,), (1,), (0, 1)]):
+        means = [
+            np.mean([played for (one, delay), played in returns.items() if one == run and delay in delays])
+            for run in dict.fromkeys(one for one, _ in returns)
+        ]
+        t = ttest_1samp(means, 0.0).confidence_interval()
+        assert rows["three seeds"][column].strip() == f"{np.mean(means):.1f} [{t.low:.1f}, {t.high:.1f}]"
+    assert "95 % intervals over 3 training seeds (Student's t), or 3 episodes (Student's t)" in out
+    assert titles == [f"{ENV} under delay: means of 3 episodes, 95 % intervals"]
+
+
 def test_an_average_pairs_episodes_of_one_start() -> None:
-    row: dict[int | str, Summary] = {
-        0: Summary.from_episodes("", [0.0, 10.0], [1, 1]), 4: Summary.from_episodes("", [10.0, 0.0], [1, 1])
-    }  # fmt: skip
-    assert average(row, [0, 4]) == "5.0 [5.0, 5.0]"  # each start has a mean of 5
-    assert average(row, [0, 4, 8]) == "5.0 [5.0, 5.0], 2 of 3"
-    assert average(row, [8]) == "-"
+    row = {0: np.array([0.0, 10.0]), 4: np.array([10.0, 0.0])}
+    over = "2 episodes (Student's t)"
+    assert average(row, [0, 4]) == ("5.0 [5.0, 5.0]", over)  # each start has a mean of 5
+    assert average(row, [0, 4, 8]) == ("5.0 [5.0, 5.0], 2 of 3", over)
+    assert average(row, [8]) == ("-", "")
+
+
+def test_an_average_pairs_training_seeds_where_all_delays_have_as_many() -> None:
+    row = {0: np.array([[1.0, 3.0], [5.0, 7.0]]), 4: np.array([[5.0, 7.0], [1.0, 3.0]]), 8: np.array([9.0, 9.0])}
+    assert average(row, [0, 4]) == ("4.0 [4.0, 4.0]", "2 training seeds (Student's t)")
+    assert average(row, [0, 8]) == ("6.5", "")
 
 
 @pytest.mark.parametrize(
     ("runs", "more", "message"),
     [
-        (["{said}", "{said}"], [], "have the label"),
+        (["a={said}", "a={said}"], [], "twice: give it other training seeds"),
+        (["a={said}"], ["--rows", "a planner=x", "a expert=x"], "two rows alike"),
         (["{said}", "x={nowhere}"], [], "does not exist"),
         (["{said}"], ["--delays", "-1"], "whole number of control steps >= 0"),
         (["{said}"], ["--workers", "0"], "must be at least 1"),

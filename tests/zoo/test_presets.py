@@ -1,14 +1,18 @@
-"""Presets: ``cpu`` is the constructors' defaults, ``paper`` the paper's table, and all exist for all algorithms."""
+"""Presets: ``cpu`` is the constructors' defaults, ``paper`` the paper's tables, and all exist for all algorithms."""
 
 from __future__ import annotations
 
+import inspect
 from argparse import Namespace
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import pytest
 
 pytest.importorskip("rl_zoo3")
+
+from stable_baselines3 import SAC
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC, PlannerConfig
 from sb3_said.zoo.arguments import Delay
@@ -16,6 +20,18 @@ from sb3_said.zoo.manager import ALGORITHMS, DelayedExperimentManager, Run
 from sb3_said.zoo.presets import PRESETS, config_file, preset_overrides
 
 TASKS = ("Ant-v5", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5")
+
+
+def merged_settings(algo: str, preset: str, env_id: str, delay: Delay, log_folder: Path) -> dict[str, Any]:
+    """Return what the command line trains with: the preset over the file's block over the constructors' defaults."""
+    run = Run([], delay, preset, 25_000)
+    manager = DelayedExperimentManager(run, Namespace(), algo, env_id, str(log_folder), verbose=0, eval_freq=-1)
+    cls, flags = ALGORITHMS[algo]
+    defaults: dict[str, Any] = {}
+    for base in reversed(cls.__mro__[: cls.__mro__.index(SAC) + 1]):
+        if "__init__" in vars(base):
+            defaults |= {name: p.default for name, p in inspect.signature(base).parameters.items()}
+    return {**defaults, **flags, **manager.read_hyperparameters()[0]}
 
 
 def paper(env_id: str, delay: Delay, max_delay: int | None = None) -> PlannerConfig:
@@ -32,12 +48,21 @@ def test_the_default_preset_and_the_constructor_make_the_same_agent(env_id: str,
     model, plain = made[0], SAID("MultiInputPolicy", DelayedObservationWrapper(gym.make(env_id), delay=2))
     assert isinstance(model, SAID) and model.policy.planner.config == plain.policy.planner.config
     names = {"buffer_size", "learning_starts", "batch_size", "tau", "gamma", "train_freq", "gradient_steps", "ent_coef"}
-    names |= {"planner_gradient_steps", "planner_train_freq", "planner_newest_fraction", "planner_terminal_penalty"}
+    names |= {"planner_gradient_steps", "planner_train_freq", "planner_newest_fraction", "relabelled_ages"}
     assert {n: getattr(model, n) for n in names} == {n: getattr(plain, n) for n in names}
     assert model.lr_schedule(1.0) == plain.lr_schedule(1.0)
     # The numbers that the results stand on.
     assert (model.learning_starts, model.planner_gradient_steps, model.planner_newest_fraction) == (10_000, 25_000, 0.2)
     assert (model.policy.planner.config.d_model, model.policy.planner.config.scored_states) == (128, "decision")
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_falling_costs_where_a_task_ends_by_it(preset: str, tmp_path: Path) -> None:
+    falls = ("Ant-v5", "Hopper-v5", "Humanoid-v5", "InvertedDoublePendulum-v5", "InvertedPendulum-v5", "Walker2d-v5")
+    for env_id in (*falls, "Reacher-v5", "Pendulum-v1"):
+        merged = merged_settings("said", preset, env_id, 2, tmp_path)
+        costs = env_id in falls or preset == "paper"  # the paper has it for all, HalfCheetah-v5 which never ends too
+        assert merged["planner_terminal_penalty"] == (-100.0 if costs else None)
 
 
 @pytest.mark.parametrize("algo", ["sac", "sa", "dr", "sadr"])
@@ -55,18 +80,40 @@ def test_the_default_preset_of_a_baseline_is_the_constructors(algo: str, tmp_pat
 
 @pytest.mark.parametrize("env_id", TASKS)
 @pytest.mark.parametrize("delay", [0, 4, 8, 16])
-def test_the_paper_preset_is_the_papers_table(env_id: str, delay: int) -> None:
-    tables = {  # Table 6: depth, temperature
+def test_the_paper_preset_merged_is_the_papers_tables(env_id: str, delay: int, tmp_path: Path) -> None:
+    tables = {  # Table 4: depth, temperature
         "Ant-v5": [(8, 0.6), (8, 0.6), (8, 0.6), (8, 0.8)],
         "HalfCheetah-v5": [(8, 0.6), (8, 0.3), (8, 0.3), (8, 0.1)],
         "Hopper-v5": [(8, 0.6), (4, 0.3), (2, 0.1), (8, 0.6)],
         "Walker2d-v5": [(8, 0.8), (8, 0.6), (4, 0.8), (8, 0.6)],
     }
-    settings = preset_overrides(config_file("said"), "paper", env_id, delay)
+    settings = merged_settings("said", "paper", env_id, delay, tmp_path)
     depth, temperature = tables[env_id][[0, 4, 8, 16].index(delay)]
-    assert settings["n_timesteps"] == 5e6 and settings["planner_gradient_steps"] == 1_000_000
-    assert PlannerConfig(**settings["planner_kwargs"]) == PlannerConfig.paper(depth, temperature, precision="auto")
+    # Table 3, in its order; a stride of 1, DDIM and the averaged weights are all that there is here
+    expected: dict[str, Any] = {"planner_terminal_penalty": -100.0, "gamma": 0.99, "learning_rate": 3e-4}
+    expected |= {"planner_gradient_steps": 1_000_000}
+    # Section 5.1 and Algorithm 1: 5 M steps, all of which the planner learns from, once; SADR as published
+    expected |= {"n_timesteps": 5e6, "buffer_size": 5_000_000, "planner_newest_fraction": 1.0}
+    expected |= {"planner_train_freq": None, "relabelled_ages": 0.0}
+    assert {name: settings[name] for name in expected} == expected
+    config = PlannerConfig(**settings["planner_kwargs"])
+    assert config == PlannerConfig.paper(depth, temperature)
+    table: dict[str, Any] = {"d_model": 256, "sampling_steps": 20, "prediction": "epsilon", "ema_decay": 0.9999}
+    table |= {"weight_factor": 2.0, "batch_size": 256, "n_candidates": 50, "horizon": 8}
+    table |= {"depth": depth, "temperature": temperature}
+    # The text: states z-scored, actions after an arctanh; a fixed mask; the mean value of all states; cosine
+    table |= {"relative_states": False, "action_transform": "tanh", "mask": "fixed", "scored_states": "all"}
+    table |= {"choice_factor": None, "lr_schedule": "cosine"}
+    # The code under the results
+    table |= {"value_scale": "centred", "precision": "float32", "learning_rate": 2e-4, "weight_decay": 1e-5}
+    table |= {"ema_warmup": False, "warmup_steps": 0, "gradient_clip": None, "schedule": "linear"}
+    assert {name: getattr(config, name) for name in table} == table
     assert not {"planner_by_delay", "base"} & {*settings, *settings["planner_kwargs"]}
+
+
+def test_the_papers_expert_is_sadr_as_published(tmp_path: Path) -> None:
+    settings = merged_settings("sadr", "paper", "Hopper-v5", 4, tmp_path)
+    assert (settings["n_timesteps"], settings["buffer_size"], settings["relabelled_ages"]) == (5e6, 5_000_000, 0.0)
 
 
 @pytest.mark.parametrize("delay", [None, 8, "8", "FixedDelay(8)"])

@@ -76,8 +76,24 @@ def test_a_grid_that_grew_plays_only_what_is_new(tmp_path: Path, capsys: pytest.
     assert cells(study) == [(0.0, 1), (0.0, 2), (0.0, 5), (1.0, 1), (1.0, 2), (1.0, 5)]
     winner = find_winner(study)  # of equals, the coldest
     assert winner is not None and winner.params == {"depth": 2, "temperature": 0.0, "sampling_steps": 2}
-    save_plot(study, tmp_path / "slice.png")
+    save_plot(study, tmp_path / "slice.png", "a task, a delay")
     assert (tmp_path / "slice.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_choice_factors_are_tried_and_at_temperature_0_one_stands_for_all(tmp_path: Path) -> None:
+    agent = Agent(lambda temperature, choice_factor, **_: temperature - (choice_factor - 3.0) ** 2)
+    study = open_study(tmp_path, str(tmp_path / "study.log"), "test", {}, 0.0)
+    tried = {"depth": [2], "temperature": [0.0, 1.0], "choice_factor": [1.0, 3.0, 100.0]}
+    search(study, tried, agent.put, agent.play, episodes=2)
+    found = {(t.params["temperature"], t.params["choice_factor"]): t.value for t in finished(study)}
+    assert len(found) == 6 and agent.n_put == 1 + 3
+    assert len({found[0.0, factor] for factor in (1.0, 3.0, 100.0)}) == 1
+    winner = find_winner(study)
+    assert winner is not None and winner.params == {"depth": 2, "temperature": 1.0, "choice_factor": 3.0}
+    study = open_study(tmp_path, str(tmp_path / "tpe.log"), "test", {}, 0.0)
+    search(study, tried | {"temperature": [1.0]}, agent.put, agent.play, "tpe", n_trials=10, episodes=2)
+    assert all(1.0 <= t.params["choice_factor"] <= 100.0 for t in finished(study))
+    assert len({t.params["choice_factor"] for t in finished(study)}) == 10
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError, MemoryError, SystemExit])

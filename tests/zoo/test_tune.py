@@ -136,6 +136,24 @@ def test_a_search_with_a_drawn_delay_or_vec_normalize(
     assert f"--delay {' '.join(map(str, delay))} -conf" in capsys.readouterr().out
 
 
+def test_a_search_for_how_the_critics_choose(run: Path) -> None:
+    grid = ["--depths", "1", "--temperatures", "0.5", "1", "--choice-factors", "0.5", "100", "--prune", "0"]
+    tune.main(["--run", str(run), *grid, *QUICK])
+    trials, winner = results_of(run)["trials"], results_of(run)["winner"]
+    assert sorted((t["temperature"], t["choice_factor"]) for t in trials) == [
+        (0.5, 0.5),
+        (0.5, 100),
+        (1, 0.5),
+        (1, 100),
+    ]
+    check_report(run)
+    best: Any = load_run(run / "tune" / "best.zip", device="cpu").model
+    assert best.policy.planner.config.choice_factor == winner["choice_factor"]
+    assert (
+        read_by_train(run / "tune" / "best.yml", 2, run)["planner_kwargs"]["choice_factor"] == winner["choice_factor"]
+    )
+
+
 def test_two_workers_share_a_study_and_train_no_depth_twice(run: Path) -> None:
     grid = ["--depths", "2", "3", "--temperatures", "0", "1"]
     command = [sys.executable, str(SCRIPT), "--run", str(run), *grid, *QUICK]
@@ -165,6 +183,7 @@ def test_two_workers_share_a_study_and_train_no_depth_twice(run: Path) -> None:
         (["--sampling-steps", "0"], "sampling_steps is 0"),
         (["--sampling-steps", "2", "2"], "--sampling-steps names a value twice: 2 2"),
         (["--depths", "0"], "depth is 0"),
+        (["--choice-factors", "-1"], "choice_factor is -1"),
         (["--depths", "1", "--timeout", "0"], "No trial is finished"),
     ],
 )

@@ -1,0 +1,83 @@
+"""Set how a trained SAID agent decides, and save it under another name; nothing is trained."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from sb3_said import SAID
+from sb3_said.planner.config import SAMPLING_SETTINGS
+from sb3_said.zoo.arguments import TRUST, explained, make_parser
+from sb3_said.zoo.runs import find_agent, read_params
+
+EPILOG = f"""\
+examples:
+  # how the agent decides now
+  sb3-said decide logs/said/Hopper-v5-delay4_1
+
+  # the critics weigh 16 candidates; beside the run's own agent, so that the other commands know its task
+  sb3-said decide logs/said/Hopper-v5-delay4_1 --temperature 1 --n-candidates 16 --choice-factor 1 \\
+      -o logs/said/Hopper-v5-delay4_1/weighed.zip
+  sb3-said evaluate logs/said/Hopper-v5-delay4_1/weighed.zip
+
+  # the fastest decision: one candidate, one denoising step
+  sb3-said decide hopper.zip --temperature 0 --sampling-steps 1 -o hopper_fast.zip
+
+At temperature 0 the planner draws one candidate from no noise, and no critic is asked. Above 0 it draws several: the
+critics score them, and the best decides (--choice-factor none), or the mean of all does, each weighed by
+exp(factor * its score in standard deviations). sb3-said tune searches for these settings.
+What was not given stays as it is. The file given is left as it is, unless -o names it.
+{TRUST}
+"""
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = make_parser(__doc__, EPILOG)
+    parser.add_argument("agent", type=Path, metavar="RUN_OR_ZIP", help="run folder of a training, or an agent's .zip")
+    parser.add_argument("--temperature", type=float, metavar="T", help="factor on the initial noise, >= 0")
+    parser.add_argument("--sampling-steps", type=int, metavar="N", help="denoising steps; time grows with them")
+    parser.add_argument("--n-candidates", type=int, metavar="N", help="plans to draw at a temperature above 0")
+    parser.add_argument("--choice-factor", type=number_or_none, metavar="BETA", help="how much the critics' scores "
+                        "weigh among the candidates, >= 0; none: the best one alone decides")  # fmt: skip
+    parser.add_argument("--scored-states", metavar="WHICH", help="states of a plan that the critics score: decision, "
+                        "future or all")  # fmt: skip
+    parser.add_argument(
+        "-o", "--output", type=Path, metavar="ZIP", help="where to save the agent with its new settings"
+    )
+    args = parser.parse_args(argv)
+    given = {name: getattr(args, name) for name in SAMPLING_SETTINGS if getattr(args, name) is not None}
+    settings: dict[str, Any] = {name: None if value == "none" else value for name, value in given.items()}
+    with explained(parser):
+        if settings and args.output is None:
+            raise ValueError("-o is missing: name the file of the agent with its new settings.")
+        if args.output is not None and not settings:
+            raise ValueError("-o saves an agent with new settings, and none is given: add --temperature, for instance.")
+        model = load_said(args.agent)
+        model.set_planner(**settings)
+    config = model.policy.planner.config
+    for name in SAMPLING_SETTINGS:
+        print(f"{name:14} {getattr(config, name)}" + "  (new)" * (name in settings))
+    if config.temperature == 0:
+        print("At temperature 0 there is one candidate: n_candidates, scored_states and choice_factor change nothing.")
+    if not model.policy.planner_is_trained:
+        print("The planner of this agent is not trained yet: its expert answers.")
+    if args.output is not None:
+        model.save(args.output)
+        print(f"Wrote {args.output}")
+
+
+def number_or_none(word: str) -> float | str:
+    """Return the number that a word is, or the word ``none``."""
+    return word if word == "none" else float(word)
+
+
+def load_said(path: Path) -> SAID:
+    """Open an agent by itself: no task is made.
+
+    :raises ValueError: when it is not a SAID agent
+    """
+    file, params = find_agent(path)
+    algo = read_params(params)[1].get("algo", "said")
+    if algo != "said":
+        raise ValueError(f"{path} is a run of '{algo}', which has no planner; give one of --algo said.")
+    return SAID.load(file, device="cpu")

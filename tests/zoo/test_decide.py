@@ -1,0 +1,103 @@
+"""sb3-said decide: the new file decides as it says, and nothing else has changed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+pytest.importorskip("rl_zoo3")
+
+import torch as th
+from small_run import ENV, TINY_PLANNER, write_run
+
+from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
+from sb3_said.evaluation import collect_observations
+from sb3_said.zoo import decide, evaluate
+
+NEW = ["--temperature", "0.5", "--n-candidates", "3", "--choice-factor", "2", "--sampling-steps", "1"]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    planner = {**TINY_PLANNER, "scored_states": "future"}
+    return write_run(tmp_path_factory.mktemp("said") / f"{ENV}-delay2_1", SAID, 2, planner_kwargs=planner)
+
+
+def load(file: Path) -> Any:
+    return SAID.load(file, device="cpu")
+
+
+def results(file: Path, folder: Path) -> dict[str, list[float]]:
+    """Return what evaluate measures of an agent's file, by who answered."""
+    target = folder / "evaluation.json"
+    evaluate.main([str(file), "--json", str(target), "--episodes", "3", "--latency-calls", "0", "--device", "cpu"])
+    return {one["label"]: one["returns"] for one in json.loads(target.read_text())["results"]}
+
+
+def test_an_agent_decides_otherwise_and_is_else_the_same(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, new = run / f"{ENV}.zip", run / "weighed.zip"
+    written = file.read_bytes()
+    decide.main([str(run), *NEW, "-o", str(new)])
+    out = capsys.readouterr().out
+    assert "choice_factor  2.0  (new)" in out and "scored_states  future\n" in out and f"Wrote {new}" in out
+    assert file.read_bytes() == written
+
+    before, after = load(file), load(new)
+    config = after.policy.planner.config
+    assert (config.temperature, config.n_candidates, config.choice_factor, config.sampling_steps) == (0.5, 3, 2.0, 1)
+    assert (
+        config.scored_states == "future" and config.weight_settings() == before.policy.planner.config.weight_settings()
+    )
+    for name, value in before.policy.state_dict().items():
+        th.testing.assert_close(after.policy.state_dict()[name], value, rtol=0, atol=0)
+    assert (after.num_timesteps, after.trained_ages) == (before.num_timesteps, before.trained_ages)
+
+    # The planner plays as set_planner makes it, and the expert as before; the run folder still says what task it is.
+    obs = collect_observations(lambda: DelayedObservationWrapper(gym.make(ENV), 2), 20, seed=0)
+    old_actions, new_actions = (model.predict(obs, deterministic=True)[0] for model in (before, after))
+    before.set_planner(temperature=0.5, n_candidates=3, choice_factor=2.0, sampling_steps=1)
+    np.testing.assert_array_equal(before.predict(obs, deterministic=True)[0], new_actions)
+    assert np.abs(new_actions - old_actions).max() > 0.01
+    assert results(new, tmp_path)["expert"] == results(file, tmp_path)["expert"]
+
+    decide.main([str(new), "--choice-factor", "none", "-o", str(new)])  # in place
+    config = load(new).policy.planner.config
+    assert config.choice_factor is None and config.temperature == 0.5
+
+
+def test_without_settings_it_shows_them(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    decide.main([str(run / f"{ENV}.zip")])
+    out = capsys.readouterr().out
+    assert "temperature    0.0\n" in out and "At temperature 0 there is one candidate" in out and "Wrote" not in out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["{run}", "--temperature", "1"], "-o is missing"),
+        (["{run}", "-o", "x.zip"], "none is given: add --temperature"),
+        (["{run}", "--temperature", "-1", "-o", "x.zip"], "temperature is -1.0, expected at least 0"),
+        (["{run}", "--scored-states", "some", "-o", "x.zip"], "expected one of ('future', 'decision', 'all')"),
+        (["{run}", "--choice-factor", "best", "-o", "x.zip"], "invalid"),
+        (["{sadr}"], "is a run of 'sadr', which has no planner"),
+        (["{sadr_zip}"], "SAID"),
+        (["nowhere"], "does not exist"),
+    ],
+)
+def test_says_what_is_wrong(
+    run: Path, tmp_path: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    paths = {"run": run, "sadr": tmp_path / "sadr", "sadr_zip": tmp_path / "agent.zip"}
+    if "sadr" in words[0]:
+        file = write_run(paths["sadr"], DelayedSAC, 1) / f"{ENV}.zip"
+        paths["sadr_zip"].write_bytes(file.read_bytes())
+    with pytest.raises(SystemExit) as exit_info:
+        decide.main([word.format(**paths) for word in words])
+    assert exit_info.value.code == 2 and message in capsys.readouterr().err
