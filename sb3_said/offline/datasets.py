@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from tqdm.auto import tqdm
 
-from sb3_said.delays.space import UNDELAYED, check_spaces
+from sb3_said.delays.space import UNDELAYED, check_spaces, scale_action
 from sb3_said.replay.buffer import DelayedReplayBuffer
 
 #: Names that files give to a column. D4RL's come first, then Minari's and SB3's.
@@ -292,7 +292,7 @@ def _checked(name: str, columns: Columns, state_space: spaces.Box, action_space:
 
     :raises ValueError: for what is no log of the task; names the row
     """
-    is_scaled = "scaled" in columns
+    box = spaces.Box(-1.0, 1.0, action_space.shape) if "scaled" in columns else action_space
     states, actions, next_states = (columns[key] for key in ("observations", "actions", "next_observations"))
     for key, x, expected in (
         ("observations", states, state_space.shape),
@@ -306,20 +306,18 @@ def _checked(name: str, columns: Columns, state_space: spaces.Box, action_space:
     floats = {key: np.asarray(columns[key], np.float32) for key in ("observations", "actions", "next_observations")}
     floats["rewards"] = np.asarray(columns["rewards"], np.float32).reshape(-1)
     for key, x in floats.items():
-        bad = ~np.isfinite(x.reshape(len(x), -1)).all(axis=1)
-        _refuse(name, bad, lambda row, key=key, x=x: f"{key} is {x[row]}, expected finite numbers")
+        bad = np.any(~np.isfinite(x.reshape(len(x), -1)), axis=1)
+        _refuse(name, bad, f"{key} must be finite", x)
     ends, terminated = columns["ends"], columns["terminated"]
-    if not is_scaled:
-        low, high = action_space.low, action_space.high
-        floats["actions"] = 2.0 * (floats["actions"] - low) / (high - low) - 1.0
-    outside = np.any(np.abs(floats["actions"]) > 1.0 + ACTION_TOLERANCE, axis=1)
-    _refuse(name, outside, lambda row: f"the action {actions[row]} is outside the bounds {action_space}")
-    _refuse(name, terminated & ~ends, lambda _: "the task ended, and the trajectory goes on")
+    half = (box.high - box.low) / 2
+    outside = np.any(np.abs(floats["actions"] - (box.low + box.high) / 2) > half * (1 + ACTION_TOLERANCE), axis=1)
+    _refuse(name, outside, f"the action is outside the bounds {box}", actions)
+    _refuse(name, terminated & ~ends, "the task ended, and the trajectory goes on", terminated)
     follows = np.all(np.isclose(next_states[:-1], states[1:], rtol=1e-3, atol=1e-3), axis=1) | ends[:-1]
-    _refuse(name, ~follows, lambda row: f"its next observation is not the one of row {row + 1}, and no flag ends it")
+    _refuse(name, ~follows, "its next observation is not that of the next row, and no flag ends it", next_states)
     return Dataset(
         floats["observations"],
-        np.clip(floats["actions"], -1.0, 1.0).astype(np.float32),
+        scale_action(floats["actions"], box).astype(np.float32),
         floats["rewards"],
         terminated,
         ends,
@@ -327,14 +325,8 @@ def _checked(name: str, columns: Columns, state_space: spaces.Box, action_space:
     )
 
 
-def _refuse(name: str, bad: np.ndarray, say: Callable[[int], str]) -> None:
+def _refuse(name: str, bad: np.ndarray, why: str, values: np.ndarray) -> None:
     """:raises ValueError: where a row is bad; it names the first, and how many there are"""
     if (rows := np.flatnonzero(bad)).size:
         more = f" ({rows.size} rows like this)" if rows.size > 1 else ""
-        raise ValueError(f"Row {rows[0]} of {name}: {say(int(rows[0]))}{more}.")
-
-
-def names_of(sources: Sequence[Any] | Any) -> Iterable[str]:
-    """Return a name of each source, for logs."""
-    for source in sources if isinstance(sources, (list, tuple)) else [sources]:
-        yield os.fspath(source) if isinstance(source, (str, os.PathLike)) else type(source).__name__
+        raise ValueError(f"Row {rows[0]} of {name}: {why}, got {values[rows[0]]}{more}.")

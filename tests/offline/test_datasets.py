@@ -211,11 +211,11 @@ def broken(log, key, row, value):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda log: broken(log, "rewards", 7, np.nan), r"Row 7 of .*log\.npz: rewards is nan"),
-        (lambda log: broken(log, "observations", (3, 1), np.inf), "Row 3 of .*: observations is .*inf"),
-        (lambda log: broken(log, "actions", (2, 0), 2.5), r"Row 2 of .*: the action \[2.5.* is outside the bounds"),
+        (lambda log: broken(log, "rewards", 7, np.nan), r"Row 7 of .*log\.npz: rewards must be finite, got nan"),
+        (lambda log: broken(log, "observations", (3, 1), np.inf), "Row 3 of .*: observations must be finite, got .*inf"),
+        (lambda log: broken(log, "actions", (2, 0), 2.5), r"Row 2 of .*: the action is outside the bounds .*, got \[2.5"),
         (lambda log: broken(log, "actions", (slice(4, 6), 1), -0.5), r"Row 4 .*\(2 rows like this\)"),
-        (lambda log: broken(log, "timeouts", 5, False), "Row 5 of .*: its next observation is not the one of row 6"),
+        (lambda log: broken(log, "timeouts", 5, False), "Row 5 of .*: its next observation is not that of the next row"),
         (lambda log: log | {"rewards": log["rewards"][:-1]}, "differ in length"),
         (lambda log: log | {"observations": log["observations"][:, :2]}, r"of shape \(2,\), and the task \(3,\)"),
         (lambda log: {k: v for k, v in log.items() if k != "actions"}, "none of actions"),
