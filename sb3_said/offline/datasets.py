@@ -55,6 +55,13 @@ class Dataset:
         return len(self.rewards)
 
     @property
+    def next_states(self) -> np.ndarray:
+        """The state after each step: (N, obs_dim), a copy."""
+        after = np.roll(self.states, -1, axis=0)
+        after[self.ends] = self.finals
+        return after
+
+    @property
     def lengths(self) -> np.ndarray:
         """Steps of each trajectory: (n_trajectories,)."""
         return np.diff(np.flatnonzero(self.ends), prepend=-1)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.utils import polyak_update
 from torch import nn
 from torch.nn import functional as F
+
+from sb3_said.offline.datasets import Dataset
 
 
 class Transitions(NamedTuple):
@@ -36,6 +39,8 @@ class IQLConfig:
     """part by which target critics move to the critics (IQL, CleanDiffuser: 0.995 kept)"""
     batch_size: int = 256
     """steps of an update (IQL, SAID paper)"""
+    updates: int = 2
+    """for each of the planner's (ours: the planner has few where it learns within hours; the paper has one)"""
 
     def __post_init__(self) -> None:
         if not 0.5 <= self.expectile < 1.0:
@@ -68,17 +73,19 @@ class ImplicitValues(nn.Module):
     scale: th.Tensor
 
     @th.no_grad()
-    def fit(self, states: th.Tensor, returns: th.Tensor) -> None:
+    def fit(self, states: th.Tensor, returns: th.Tensor, longest: int) -> None:
         """Take over how states and trajectory returns are spread.
 
         :param states: (M, obs_dim)
-        :param returns: (n_trajectories,); rewards are multiplied by 1000 / (largest - smallest), as IQL does on MuJoCo
+        :param returns: (n_trajectories,)
+        :param longest: T, steps of the longest trajectory. Rewards are multiplied by T / (largest - smallest return),
+            which is IQL's 1000 / (...) on MuJoCo
         """
         std, mean = th.std_mean(states, dim=0)
         self.mean.copy_(mean)
         self.std.copy_(th.where(std > 1e-6, std, 1.0))
         spread = returns.max() - returns.min()
-        self.scale.copy_(1000.0 / spread if spread > 0 else th.ones(()))
+        self.scale.copy_(longest / spread if spread > 0 else th.ones(()))
 
     def value(self, states: th.Tensor) -> th.Tensor:
         """Return V(s) as the environment's rewards would sum up.
@@ -114,28 +121,50 @@ class ImplicitValues(nn.Module):
 
 
 class IQL:
-    """Trains :class:`ImplicitValues`, one batch a call.
+    """Trains :class:`ImplicitValues` on a dataset, one batch a step.
 
-    :param values: what to train
+    :param values: what to train; its scales are fitted to the data
+    :param data: logged trajectories
     :param gamma: discount factor
+    :param seed: of the batches
     """
 
-    def __init__(self, values: ImplicitValues, gamma: float):
+    def __init__(self, values: ImplicitValues, data: Dataset, gamma: float, seed: int = 0):
         self.values, self.gamma = values, gamma
+        device = values.mean.device
+        rows = (data.states, data.actions, data.rewards, data.next_states, data.terminated.astype(np.float32))
+        self.data = Transitions(*(th.from_numpy(np.ascontiguousarray(column)).to(device) for column in rows))
+        values.fit(self.data.states, th.from_numpy(data.returns).to(device), int(data.lengths.max()))
         trained = [*values.v.parameters(), *values.q.parameters()]
         self.optimizer = th.optim.Adam(trained, lr=values.config.learning_rate)
+        self.generator = th.Generator().manual_seed(seed)
 
-    def update(self, batch: Transitions) -> dict[str, float]:
-        """Make one step of gradient descent, and move the target critics.
+    def step(self) -> dict[str, th.Tensor]:
+        """Make one step of gradient descent on a batch of all steps alike, and move the target critics.
 
         :return: both losses
         """
-        losses = self.values.losses(batch, self.gamma)
+        drawn = th.randint(len(self.data.rewards), (self.values.config.batch_size,), generator=self.generator)
+        losses = self.values.losses(Transitions(*(part[drawn.to(part.device)] for part in self.data)), self.gamma)
         self.optimizer.zero_grad()
-        sum(losses.values(), start=th.zeros(())).backward()
+        (losses["v_loss"] + losses["q_loss"]).backward()
         self.optimizer.step()
         polyak_update(self.values.q.parameters(), self.values.q_target.parameters(), self.values.config.target_rate)
-        return {name: loss.item() for name, loss in losses.items()}
+        return losses
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that goes on with the training needs, but the data."""
+        return {
+            "values": self.values.state_dict(),
+            "optimizer": self.optimizer.state_dict()["state"],
+            "generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from what :meth:`state_dict` returned."""
+        self.values.load_state_dict(state["values"])
+        self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": state["optimizer"]})
+        self.generator.set_state(state["generator"])
 
 
 def expectile_loss(difference: th.Tensor, expectile: float) -> th.Tensor:

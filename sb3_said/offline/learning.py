@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import configure_logger
 
@@ -43,28 +44,44 @@ class OfflineAlgorithm(DelayedSAC):
         :param progress_bar: show one
         :raises ValueError: as ``load_dataset`` does
         """
+        watcher = self._begin_offline(dataset, gradient_steps, callback, tb_log_name, reset_num_timesteps, progress_bar)
+        while self.num_timesteps < self._total_timesteps:
+            self.train(1, self.batch_size)
+            self.num_timesteps += 1
+            if log_interval is not None and self.num_timesteps % log_interval == 0:
+                self.logger.dump(self.num_timesteps)
+            if not self._goes_on(watcher):
+                break
+        watcher.on_training_end()
+        return self
+
+    def _begin_offline(
+        self,
+        dataset: Any,
+        gradient_steps: int,
+        callback: MaybeCallback,
+        tb_log_name: str | None,
+        reset_num_timesteps: bool,
+        progress_bar: bool,
+    ) -> BaseCallback:
+        """Do what SB3's ``_setup_learn`` does, but for the environment, and start the callbacks."""
         self.take_dataset(dataset, progress_bar)
         self.start_time = time.time_ns()
         if reset_num_timesteps:
             self.num_timesteps = 0
         self._num_timesteps_at_start = self.num_timesteps
-        self._total_timesteps = total = self.num_timesteps + gradient_steps
+        self._total_timesteps = self.num_timesteps + gradient_steps
         if not self._custom_logger:
             name = tb_log_name or type(self).__name__
             self._logger = configure_logger(self.verbose, self.tensorboard_log, name, reset_num_timesteps)
         watcher = self._init_callback(callback, progress_bar)
-        watcher.on_training_start(locals(), globals())
-        while self.num_timesteps < total:
-            self.train(1, self.batch_size)
-            self.num_timesteps += 1
-            self._update_current_progress_remaining(self.num_timesteps, total)
-            if log_interval is not None and self.num_timesteps % log_interval == 0:
-                self.logger.dump(self.num_timesteps)
-            watcher.update_locals(locals())
-            if not watcher.on_step():
-                break
-        watcher.on_training_end()
-        return self
+        watcher.on_training_start({"self": self, "total_timesteps": self._total_timesteps}, {})
+        return watcher
+
+    def _goes_on(self, watcher: BaseCallback) -> bool:
+        """Call the callbacks after a gradient step; return whether learning goes on."""
+        self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+        return watcher.on_step()
 
     def take_dataset(self, dataset: Any, progress_bar: bool = False) -> None:
         """Replace the replay buffer by a dataset, whose episodes are seen at the ages that this agent's delay gives.
