@@ -18,7 +18,7 @@ MAY_IMPORT = {
     "planner": {"replay"},
     "files": set(),
     "sac": {"delays", "replay", "files"},
-    "said": {"delays", "replay", "planner", "files", "sac"},
+    "said": {"delays", "replay", "planner", "files", "sac", "offline"},
     "offline": {"delays", "replay", "sac"},
     "evaluation": set(),
     "zoo": {"", "delays", "replay", "planner", "files", "sac", "said", "evaluation"},

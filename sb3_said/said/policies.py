@@ -15,11 +15,13 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_said.delays.space import KEYS, STATE_KEYS, UNDELAYED, check_spaces, has_state_history
+from sb3_said.offline.iql import ImplicitValues
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner.graphs import EAGER_CALLS
 from sb3_said.sac.policies import DelayedSACPolicy
 
 Answer = Literal["planner", "expert"]
+Value = Literal["critics", "iql"]
 
 
 class SAIDPolicy(DelayedSACPolicy):
@@ -29,6 +31,8 @@ class SAIDPolicy(DelayedSACPolicy):
     :meth:`set_answer` says otherwise.
 
     :param planner_kwargs: fields of :class:`~sb3_said.planner.PlannerConfig`
+    :param value: who values planned states: ``"critics"``, the expert's, by min Q(s, a); or ``"iql"``, a V(s) of its
+        own (see :class:`~sb3_said.offline.ImplicitValues`)
     :param policy_kwargs: of :class:`~sb3_said.sac.DelayedSACPolicy`
     :raises ValueError: for an unknown planner setting, a delayed task whose critics do not read the true state, or a
         ``state_history`` that the planner is not trained to read
@@ -44,6 +48,7 @@ class SAIDPolicy(DelayedSACPolicy):
         lr_schedule: Schedule,
         *,
         planner_kwargs: dict[str, Any] | None = None,
+        value: Value = "critics",
         **policy_kwargs: Any,
     ):
         super().__init__(observation_space, action_space, lr_schedule, **policy_kwargs)
@@ -59,6 +64,7 @@ class SAIDPolicy(DelayedSACPolicy):
         self.register_buffer("expert_preferred", th.zeros(()))  # 1: it answers although the planner is trained
         with th.random.fork_rng(devices=[]):  # the expert learns as it would without a planner
             self.make_planner(PlannerConfig(**given))
+            self.set_value(value)
         if has_state_history(observation_space) and self.planner.config.extra_state_probability == 0:
             raise ValueError(
                 "Observations have a state_history, but the planner is not trained with extra known states; give "
@@ -74,6 +80,18 @@ class SAIDPolicy(DelayedSACPolicy):
         self.planner = InpaintingPlanner(obs_dim, act_dim, max_delay, config).to(self.device).requires_grad_(False)
         self.planner_updates.zero_()
         self.expert_preferred.zero_()
+
+    def set_value(self, value: Value) -> None:
+        """Value planned states by the expert's critics, or by a new, untrained V(s).
+
+        :raises ValueError: for another name
+        """
+        if value not in get_args(Value):
+            raise ValueError(f"value is {value!r}, expected one of {', '.join(get_args(Value))}.")
+        self.values: ImplicitValues | None = None
+        if value == "iql":
+            state_space, _ = check_spaces(self.observation_space, self.action_space)
+            self.values = ImplicitValues(state_space.shape[0], self.action_space.shape[0]).to(self.device)  # type: ignore[index]  # a Box has a shape
 
     @property
     def planner_is_trained(self) -> bool:
@@ -115,12 +133,16 @@ class SAIDPolicy(DelayedSACPolicy):
             raise ValueError("The planner is not trained yet; call learn() or train_planner() first.")
 
     def value(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """Return min over the critics of Q(s, a), which scores candidates (MCSS) and bootstraps trajectory weights.
+        """Return V(s), or min over the critics of Q(s, a), which scores candidates (MCSS).
 
         :param states: (..., obs_dim)
-        :param actions: (..., act_dim) in [-1, 1]
+        :param actions: (..., act_dim) in [-1, 1]; V(s) does without
         :return: (...)
         """
+        return self.q_value(states, actions) if self.values is None else self.values.value(states)
+
+    def q_value(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """Return min over the critics of Q(s, a): (...)."""
         if self.critic.training:  # SB3 leaves it so; Dropout would draw, and BatchNorm learn from plans
             self.critic.set_training_mode(False)
         flat = states.flatten(0, -2)
@@ -199,7 +221,11 @@ class SAIDPolicy(DelayedSACPolicy):
         self.planner.train(mode)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "planner_kwargs": self.planner.config.to_dict()}
+        return {
+            **super()._get_constructor_parameters(),
+            "planner_kwargs": self.planner.config.to_dict(),
+            "value": "critics" if self.values is None else "iql",
+        }
 
 
 def _rows(observation: PyTorchObs) -> Iterator[PyTorchObs]:

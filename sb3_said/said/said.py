@@ -3,42 +3,40 @@
 from __future__ import annotations
 
 import warnings
-import zlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
-from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import configure_logger
-from tqdm.auto import tqdm
 
 from sb3_said.delays.space import ages_of, has_state_history
-from sb3_said.files.archive import load_tree, save_tree
+from sb3_said.offline import IQL, ImplicitValues, OfflineAlgorithm, load_dataset
 from sb3_said.planner.config import SAMPLING_SETTINGS
-from sb3_said.planner.trainer import PlannerTrainer, worse_than_regression
+from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.planner.values import returns_to_go
-from sb3_said.sac import DelayedSAC
 from sb3_said.said.callbacks import PlannerTrainingCallback
-from sb3_said.said.policies import Answer, SAIDPolicy
+from sb3_said.said.policies import Answer, SAIDPolicy, Value
+from sb3_said.said.training import PlannerTraining
 from sb3_said.said.trial import let_the_better_answer
 
 HELD_OUT = 0.05  # of the planner's data
-PLANNER_CHECKPOINT_NAME = "planner_checkpoint.zip"
+HAND_OVER_INTERVAL = 100  # updates of an offline training
 
 SelfSAID = TypeVar("SelfSAID", bound="SAID")
 
 
-class SAID(DelayedSAC):
-    """State-Action Inpainting Diffuser, online (paper, Algorithm 1).
+class SAID(OfflineAlgorithm):
+    """State-Action Inpainting Diffuser, online (paper, Algorithm 1) and offline (Algorithm 2).
 
     ``learn`` runs the expert (SADR), then trains a diffusion transformer on windows of its replay buffer. ``predict``
     asks the expert until the planner is trained, and then whoever of the two does better in a few episodes. The planner
     inpaints what the delay hides and the plan behind it; at a temperature above 0 many times, and the critics choose.
-    Collection always uses the expert.
+    Collection always uses the expert. ``learn_offline`` trains the planner on logs instead, without an expert.
 
     :param policy: ``"MultiInputPolicy"`` or ``"MlpPolicy"``, which name the same class
     :param env: a task in a ``DelayedObservationWrapper``, or one with a 1-D Box observation (delay 0)
@@ -53,13 +51,15 @@ class SAID(DelayedSAC):
         the reward, for tasks that may end because they are done
     :param planner_trial_episodes: of the training environment, played with the planner after its training and as many
         with the expert; the better one answers. They come on top of ``learn``'s steps. 0: the planner answers
+    :param value: who scores the planner's candidates: ``"critics"``, the expert's, by min Q(s, a); or ``"iql"``, a
+        V(s) that is learned beside the planner by implicit Q-learning, which is what offline learning has
     :param sac_kwargs: every other argument of :class:`~sb3_said.sac.DelayedSAC` and of SB3's ``SAC``
     :raises ValueError: as ``DelayedSAC`` does, for planner settings outside their range, and for a ``state_history``
         in the observations that the planner is not trained to read or that ``VecNormalize`` leaves unscaled
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": SAIDPolicy, "MultiInputPolicy": SAIDPolicy}
-    counters = (*DelayedSAC.counters, "_planner_trained_at")
+    counters = (*OfflineAlgorithm.counters, "_planner_trained_at")
     policy: SAIDPolicy
 
     def __init__(
@@ -74,11 +74,12 @@ class SAID(DelayedSAC):
         planner_newest_fraction: float = 0.2,
         planner_terminal_penalty: float | None = None,
         planner_trial_episodes: int = 5,
+        value: Value = "critics",
         **sac_kwargs: Any,
     ):
-        for name, value in (("gradient_steps", planner_gradient_steps), ("train_freq", planner_train_freq)):
-            if value is not None and value < 1:
-                raise ValueError(f"planner_{name} must be at least 1, got {value}.")
+        for name, count in (("gradient_steps", planner_gradient_steps), ("train_freq", planner_train_freq)):
+            if count is not None and count < 1:
+                raise ValueError(f"planner_{name} must be at least 1, got {count}.")
         if not 0.0 < planner_newest_fraction <= 1.0:
             raise ValueError(
                 f"planner_newest_fraction is a part of the buffer in (0, 1], got {planner_newest_fraction}."
@@ -91,6 +92,7 @@ class SAID(DelayedSAC):
         self.planner_newest_fraction = planner_newest_fraction
         self.planner_terminal_penalty = planner_terminal_penalty
         self.planner_trial_episodes = planner_trial_episodes
+        self.value = value
         self._planner_trained_at = 0  # num_timesteps of the last planner training
         super().__init__(policy, env, learning_rate, **sac_kwargs)
 
@@ -115,7 +117,7 @@ class SAID(DelayedSAC):
                 warnings.warn(str(error), stacklevel=3)
 
     def _policy_flags(self) -> dict[str, Any]:
-        return {**super()._policy_flags(), "planner_kwargs": self.planner_kwargs}
+        return {**super()._policy_flags(), "planner_kwargs": self.planner_kwargs, "value": self.value}
 
     def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:
         """Keep this agent's own planner where the given one was never trained and has other settings."""
@@ -202,7 +204,8 @@ class SAID(DelayedSAC):
         :raises ValueError: when the buffer is empty, as it is after ``load``
         """
         source = self.replay_buffer.window_source(self.planner_newest_fraction, self._vec_normalize_env)
-        values = returns_to_go(source, self.gamma, self.planner_terminal_penalty, self._stored_values)
+        bootstrap = self._stored_values if self._n_updates > 0 else None  # offline there are no critics
+        values = returns_to_go(source, self.gamma, self.planner_terminal_penalty, bootstrap)
         return PlannerTrainer(
             self.policy.planner,
             replace(source, values=values),
@@ -214,7 +217,7 @@ class SAID(DelayedSAC):
     @th.no_grad()
     def _stored_values(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """Return values as the environment's rewards would sum up, of states as windows have them: (B,)."""
-        values = self.policy.value(states.to(self.device), actions.to(self.device)).cpu()
+        values = self.policy.q_value(states.to(self.device), actions.to(self.device)).cpu()
         env = self._vec_normalize_env
         return values if env is None else th.from_numpy(env.unnormalize_reward(values.numpy()))
 
@@ -248,63 +251,94 @@ class SAID(DelayedSAC):
         """
         if not hasattr(self, "_logger"):  # not set_logger: learn() makes its own
             self._logger = configure_logger(self.verbose, self.tensorboard_log, "SAID", reset_num_timesteps=False)
-        trainer = self.make_planner_trainer(gradient_steps)
-        total = trainer.gradient_steps
-        checkpoint = None if folder is None else Path(folder) / PLANNER_CHECKPOINT_NAME
-        replay = self.replay_buffer.actions[: self.replay_buffer.size()]
-        data = {"num_timesteps": self.num_timesteps, "replay": zlib.crc32(replay.data)}
-        if checkpoint is not None and checkpoint.exists():
-            state = load_tree(checkpoint)
-            if {key: state[key] for key in data} == data:
-                trainer.load_state_dict(state["trainer"])
-
-        def on_update(trainer: PlannerTrainer) -> None:
-            bar.update()
-            done = trainer.n_updates
-            is_end = done == total
-            if done % log_interval == 0 or is_end:
-                losses = trainer.pop_losses()
-                bar.set_postfix(loss=losses["planner/loss"])
-                errors = trainer.evaluate() if done % eval_interval == 0 or is_end else {}
-                self._log_planner({**losses, **errors, "planner/n_updates": done}, done)
-                if is_end and (worse := worse_than_regression(errors)):
-                    warnings.warn(
-                        f"On held-out windows the planner is still worse than a small regression: {worse}. It is "
-                        "undertrained; give it more planner_gradient_steps, or more data.",
-                        stacklevel=4,
-                    )
-            if checkpoint is not None and (done % save_interval == 0 or is_end):
-                save_tree(checkpoint, {**data, "trainer": trainer.state_dict()})
-
-        if trainer.n_updates < total and not progress_bar and self.verbose == 0:
+        if not progress_bar and self.verbose == 0:
+            total = self.planner_gradient_steps if gradient_steps is None else gradient_steps
             print(
                 f"Training the planner: {total} updates. progress_bar=True or verbose=1 shows how far it is.",
                 flush=True,
             )
-        with tqdm(total=total, initial=trainer.n_updates, desc="planner", disable=not progress_bar) as bar:
-            try:
-                trainer.train(callback=on_update)
-            except KeyboardInterrupt:
-                trainer.hand_over()
-                outcome = "keeps what it learned" if trainer.n_updates > 0 else "stays as it was"
-                print(f"Planner training interrupted after {trainer.n_updates} of {total} updates; it {outcome}.")
-                trial_episodes = 0
-        if trainer.n_updates > 0:
-            self.policy.planner_updates.fill_(float(trainer.n_updates))
-            self._settle_answer(self.planner_trial_episodes if trial_episodes is None else trial_episodes, progress_bar)
+
+        def row(n_updates: int) -> int:
+            return self.num_timesteps + (n_updates if self.planner_train_freq is None else 0)
+
+        training = PlannerTraining(
+            self, self.make_planner_trainer(gradient_steps), self._make_value_trainer(), folder, row
+        )
+        intervals: dict[str, Any] = {
+            "log_interval": log_interval,
+            "eval_interval": eval_interval,
+            "save_interval": save_interval,
+        }
+        if not training.run(progress_bar, **intervals):
+            trial_episodes = 0
+        if training.trainer.n_updates > 0:
+            self.set_answer("planner")
+            n_episodes = self.planner_trial_episodes if trial_episodes is None else trial_episodes
+            if n_episodes > 0 and self.env is not None:
+                training.log(let_the_better_answer(self, n_episodes, progress_bar))
         self._planner_trained_at = self.num_timesteps
 
-    def _settle_answer(self, n_episodes: int, progress_bar: bool) -> None:
-        """Let the newly trained planner answer, or whoever is better in a trial."""
-        self.set_answer("planner")
-        if n_episodes > 0 and self.env is not None:
-            returns = let_the_better_answer(self, n_episodes, progress_bar)
-            self._log_planner(returns, int(self.policy.planner_updates))
+    def _make_value_trainer(self) -> IQL | None:
+        """Return a trainer of V(s) on the replay buffer, where that is who values plans."""
+        if self.policy.values is None:
+            return None
+        data, env = load_dataset(self.replay_buffer, self.observation_space, self.action_space), self._vec_normalize_env
+        if env is not None:  # V reads states as the planner has them
+            is_dict = isinstance(self.observation_space, spaces.Dict)
+            normalized: list[Any] = [
+                env.normalize_obs({"observation": x})["observation"] if is_dict else env.normalize_obs(x)
+                for x in (data.states, data.finals)
+            ]
+            data = replace(data, states=normalized[0], finals=normalized[1])
+        with th.random.fork_rng(devices=[]):
+            th.manual_seed(self.seed or 0)
+            values = ImplicitValues(data.states.shape[1], data.actions.shape[1]).to(self.device)
+        return IQL(values, data, self.gamma, self.seed or 0)
 
-    def _log_planner(self, values: dict[str, float], n_updates: int) -> None:
-        """Write a row with a logger of its own, to the same places: the user's keeps what it holds for its next row."""
-        log = Logger(self.logger.dir, self.logger.output_formats)
-        log.set_level(self.logger.level)
-        for key, value in values.items():
-            log.record(key, value)
-        log.dump(self.num_timesteps + (n_updates if self.planner_train_freq is None else 0))
+    def learn_offline(  # type: ignore[override]
+        self: SelfSAID,
+        dataset: Any,
+        gradient_steps: int | None = None,
+        callback: MaybeCallback = None,
+        log_interval: int = 500,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+        folder: str | Path | None = None,
+        **intervals: Any,
+    ) -> SelfSAID:
+        """Train the planner, and V(s) beside it, on logs of a task without delay (paper, Algorithm 2).
+
+        No environment is stepped and no expert is trained; the planner serves every delay 0..D. Callbacks are called
+        after each update, and meet a planner that is at most 100 updates old. ``num_timesteps`` counts updates.
+
+        :param dataset: whatever :func:`~sb3_said.offline.load_dataset` reads
+        :param gradient_steps: ``planner_gradient_steps`` by default
+        :param callback: SB3 callbacks, such as ``EvalCallback``
+        :param log_interval: updates between two rows of losses in the log
+        :param tb_log_name: name of the run in TensorBoard
+        :param reset_num_timesteps: has no effect: each training of a planner begins anew
+        :param progress_bar: show one
+        :param folder: keep a checkpoint there, and continue from it if it is of the same training
+        :param intervals: ``eval_interval`` and ``save_interval`` of :meth:`train_planner`
+        :raises ValueError: as ``load_dataset`` and :meth:`train_planner` do
+        """
+        total = self.planner_gradient_steps if gradient_steps is None else gradient_steps
+        self.value = "iql"
+        self.policy.set_value("iql")
+        watcher = self._begin_offline(dataset, total, callback, tb_log_name, True, progress_bar)
+        training = PlannerTraining(
+            self, self.make_planner_trainer(total), self._make_value_trainer(), folder, row=lambda n_updates: n_updates
+        )
+
+        def on_step(n_updates: int) -> bool:
+            self.num_timesteps = n_updates
+            if n_updates % HAND_OVER_INTERVAL == 0:
+                training.hand_over()
+            return self._goes_on(watcher)
+
+        training.run(on_step=on_step, log_interval=log_interval, **intervals)
+        if training.trainer.n_updates > 0:
+            self.set_answer("planner")
+        watcher.on_training_end()
+        return self

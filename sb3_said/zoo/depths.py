@@ -12,7 +12,8 @@ from filelock import FileLock, Timeout
 from stable_baselines3.common.logger import Logger, make_output_format
 
 from sb3_said.files.archive import load_tree, save_tree
-from sb3_said.said.said import PLANNER_CHECKPOINT_NAME, SAID
+from sb3_said.said import SAID
+from sb3_said.said.training import PLANNER_CHECKPOINT_NAME
 from sb3_said.zoo.manager import log_suffix
 
 

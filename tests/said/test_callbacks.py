@@ -15,7 +15,7 @@ from sb3_said import SAID, DelayedObservationWrapper, PlannerTrainingCallback
 from sb3_said.files.checkpoint import TrainingCheckpointCallback, restore_training
 from sb3_said.planner import InpaintingPlanner
 from sb3_said.planner.trainer import PlannerTrainer
-from sb3_said.said.said import PLANNER_CHECKPOINT_NAME
+from sb3_said.said.training import PLANNER_CHECKPOINT_NAME
 
 PLANNER = {"d_model": 32, "depth": 1, "horizon": 3, "batch_size": 16, "sampling_steps": 2, "n_candidates": 3}
 

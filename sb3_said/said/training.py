@@ -1,0 +1,134 @@
+"""One training of SAID's planner: values beside it, rows in the log, and a checkpoint to go on from."""
+
+from __future__ import annotations
+
+import warnings
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.logger import Logger
+from tqdm.auto import tqdm
+
+from sb3_said.files.archive import load_tree, save_tree
+from sb3_said.offline.iql import IQL
+from sb3_said.planner.trainer import PlannerTrainer, worse_than_regression
+
+PLANNER_CHECKPOINT_NAME = "planner_checkpoint.zip"
+
+SAID = Any  # whose module imports this one
+
+
+class PlannerTraining:
+    """Runs a trainer of the planner, and one of its values, to their end.
+
+    :param model: whose planner it is
+    :param trainer: of the planner
+    :param values: trained beside it, None for none
+    :param folder: keep a checkpoint there, and continue from it if it is of the same training
+    :param row: maps the updates made to where in the log their row stands
+    :raises ValueError: when the checkpoint is of a training with other settings
+    """
+
+    def __init__(
+        self,
+        model: SAID,
+        trainer: PlannerTrainer,
+        values: IQL | None,
+        folder: str | Path | None,
+        row: Callable[[int], int],
+    ):
+        self.model, self.trainer, self.values, self.row = model, trainer, values, row
+        self.checkpoint = None if folder is None else Path(folder) / PLANNER_CHECKPOINT_NAME
+        replay = model.replay_buffer.actions[: model.replay_buffer.size()]
+        self._data = {"num_timesteps": model.num_timesteps, "replay": zlib.crc32(replay.data)}
+        self._value_losses: dict[str, float] = {}
+        if self.checkpoint is not None and self.checkpoint.exists():
+            state = load_tree(self.checkpoint)
+            if {key: state[key] for key in self._data} == self._data:
+                trainer.load_state_dict(state["trainer"])
+                if values is not None:
+                    values.load_state_dict(state["values"])
+
+    def run(
+        self,
+        progress_bar: bool = False,
+        on_step: Callable[[int], bool] | None = None,
+        *,
+        log_interval: int = 500,
+        eval_interval: int = 2_000,
+        save_interval: int = 1_000,
+    ) -> bool:
+        """Make all updates that are left. Ctrl-C ends the training early and keeps the planner as far as it got.
+
+        :param on_step: called with the number of updates made after each; training stops when it returns False
+        :return: whether it was not interrupted
+        """
+        trainer, total = self.trainer, self.trainer.gradient_steps
+
+        def on_update(trainer: PlannerTrainer) -> bool:
+            bar.update()
+            done = trainer.n_updates
+            is_end = done == total
+            self._train_values()
+            if done % log_interval == 0 or is_end:
+                bar.set_postfix(loss=self._log_row(done % eval_interval == 0 or is_end))
+            if self.checkpoint is not None and (done % save_interval == 0 or is_end):
+                self._save(self.checkpoint)
+            return on_step is None or on_step(done)
+
+        is_interrupted = False
+        with tqdm(total=total, initial=trainer.n_updates, desc="planner", disable=not progress_bar) as bar:
+            try:
+                trainer.train(callback=on_update)
+            except KeyboardInterrupt:
+                is_interrupted = True
+        if is_interrupted:
+            outcome = "keeps what it learned" if trainer.n_updates > 0 else "stays as it was"
+            print(f"Planner training interrupted after {trainer.n_updates} of {total} updates; it {outcome}.")
+        self.hand_over()
+        return not is_interrupted
+
+    def hand_over(self) -> None:
+        """Give the agent the planner and the values as far as they got; before the first update, leave it as it is.
+
+        :raises FloatingPointError: when an update was not finite; the agent stays as it was
+        """
+        self.trainer.hand_over()
+        if self.trainer.n_updates > 0:
+            self.model.policy.planner_updates.fill_(float(self.trainer.n_updates))
+            if self.values is not None:
+                self.model.policy.values.load_state_dict(self.values.values.state_dict())
+
+    def log(self, values: dict[str, float]) -> None:
+        """Write a row with a logger of its own, to the same places: the user's keeps what it holds for its next row."""
+        log = Logger(self.model.logger.dir, self.model.logger.output_formats)
+        log.set_level(self.model.logger.level)
+        for key, value in values.items():
+            log.record(key, value)
+        log.dump(self.row(self.trainer.n_updates))
+
+    def _train_values(self) -> None:
+        if self.values is None:
+            return
+        for _ in range(self.values.values.config.updates):
+            self._value_losses = {f"iql/{name}": float(loss.detach()) for name, loss in self.values.step().items()}
+
+    def _log_row(self, evaluates: bool) -> float:
+        """Write losses, and the held-out errors if asked for; return the loss."""
+        losses = self.trainer.pop_losses()
+        errors = self.trainer.evaluate() if evaluates else {}
+        self.log({**losses, **self._value_losses, **errors, "planner/n_updates": self.trainer.n_updates})
+        is_end = self.trainer.n_updates == self.trainer.gradient_steps
+        if is_end and (worse := worse_than_regression(errors)):
+            warnings.warn(
+                f"On held-out windows the planner is still worse than a small regression: {worse}. It is undertrained; "
+                "give it more planner_gradient_steps, or more data.",
+                stacklevel=6,
+            )
+        return losses["planner/loss"]
+
+    def _save(self, path: Path) -> None:
+        values = None if self.values is None else self.values.state_dict()
+        save_tree(path, {**self._data, "trainer": self.trainer.state_dict(), "values": values})

@@ -1,0 +1,134 @@
+"""SAID from logs: no environment, values of its own, and the same files, callbacks and resumes as online."""
+
+import numpy as np
+import pytest
+import torch as th
+from small_agent import answer, make, observe
+from small_task import delayed
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_said import SAID
+from sb3_said.offline import Dataset
+from sb3_said.said.training import PlannerTraining
+
+
+def log(n_episodes=6, length=12, seed=0):
+    """Return episodes of the small task under random actions; the state steers the reward."""
+    rng = np.random.default_rng(seed)
+    states, actions = np.zeros((n_episodes, length + 1, 2), np.float32), np.zeros((n_episodes, length, 1), np.float32)
+    states[:, 0] = rng.normal(size=(n_episodes, 2))
+    for t in range(length):
+        actions[:, t] = rng.uniform(-1, 1, (n_episodes, 1))
+        states[:, t + 1] = 0.9 * states[:, t] + 0.1 * np.stack([2 * actions[:, t, 0], states[:, t, 0]], axis=1)
+    ends = np.zeros((n_episodes, length), bool)
+    ends[:, -1] = True
+    rewards = -np.abs(states[:, :-1, 0]).ravel()
+    flat = states[:, :-1].reshape(-1, 2), actions.reshape(-1, 1)
+    return Dataset(*flat, rewards, np.zeros(ends.size, bool), ends.ravel(), states[:, -1])
+
+
+def learn(model=None, steps=8, **kwargs):
+    model = make() if model is None else model
+    return model.learn_offline(log(), steps, **kwargs)
+
+
+def weights(model):
+    return {name: value.clone() for name, value in model.policy.state_dict().items() if name != "planner_updates"}
+
+
+@pytest.fixture(scope="module")
+def learned():
+    model = make()
+    model.env.envs[0].step = model.env.envs[0].reset = None  # neither is called
+    return learn(model)
+
+
+def test_the_planner_answers_after_learning_from_logs(learned, tmp_path):
+    assert learned.policy.who_answers == "planner" and learned.policy.planner_updates == 8
+    assert learned._n_updates == 0  # no expert
+    learned.save(tmp_path / "agent.zip")
+    loaded = SAID.load(tmp_path / "agent.zip", device="cpu")
+    obs = observe()
+    np.testing.assert_array_equal(answer(loaded, obs), answer(learned, obs))
+    states = th.randn(5, 2)
+    with th.no_grad():
+        assert th.equal(loaded.policy.value(states, None), learned.policy.value(states, None))
+    assert loaded.value == "iql"
+
+
+def test_candidates_are_scored_by_v_alone(learned, monkeypatch):
+    monkeypatch.setattr(type(learned.policy), "q_value", lambda *_: pytest.fail("asked the critics"))
+    obs, before = observe(), answer(learned, observe())
+    with th.no_grad():  # a V that likes the other end of states chooses other candidates
+        learned.policy.values.v[-1].weight.neg_()
+        flipped = answer(learned, obs)
+        learned.policy.values.v[-1].weight.neg_()
+    assert not np.array_equal(before, flipped)
+    np.testing.assert_array_equal(answer(learned, obs), before)
+
+
+def test_v_is_learned_online_too_and_before_it_the_critics_bootstrap():
+    model = make(value="iql").learn(60)
+    fresh = make(value="iql").policy.values.v[0].weight
+    assert model.policy.values is not None and not th.equal(model.policy.values.v[0].weight, fresh)
+    with pytest.raises(ValueError, match="value is 'v', expected one of critics, iql"):
+        make(value="v")
+
+
+def test_values_read_states_as_vec_normalize_leaves_them():
+    """The planner has normalised states, so V must too: its z-scores then find nothing left to scale."""
+    env = VecNormalize(DummyVecEnv([lambda: delayed()]), norm_obs_keys=["observation"], norm_reward=False)
+    model = make(env=env, value="iql").learn(60)
+    states = model.replay_buffer.observations[:60, 0]
+    normalized = env.normalize_obs({"observation": states})["observation"]
+    np.testing.assert_allclose(model.policy.values.mean, normalized.mean(0), atol=1e-5)
+
+
+def test_callbacks_follow_each_update_meet_a_young_planner_and_can_end_it(monkeypatch):
+    monkeypatch.setattr("sb3_said.said.said.HAND_OVER_INTERVAL", 2)
+    seen = []
+
+    class Watch(BaseCallback):
+        def _on_step(self):
+            seen.append((self.num_timesteps, int(self.model.policy.planner_updates)))
+            return self.num_timesteps < 5
+
+    model = learn(callback=Watch())
+    assert seen == [(1, 0), (2, 2), (3, 2), (4, 4), (5, 4)]
+    assert model.num_timesteps == model.policy.planner_updates == 5
+
+
+def test_a_resumed_training_ends_as_one_that_never_stopped(tmp_path):
+    whole = weights(learn())
+
+    class Stop(BaseCallback):
+        def _on_step(self):
+            if self.num_timesteps == 4:
+                raise ConnectionAbortedError
+            return True
+
+    with pytest.raises(ConnectionAbortedError):
+        learn(callback=Stop(), folder=tmp_path, save_interval=2)
+    resumed = make()
+    begun = []
+    resumed_training = resumed.learn_offline(
+        log(), 8, folder=tmp_path, save_interval=2, callback=lambda a, _: begun.append(a["self"].num_timesteps) or True
+    )
+    assert begun[0] == 5
+    th.testing.assert_close(weights(resumed_training), whole, rtol=0, atol=0)
+
+
+def test_a_failed_training_changes_nothing(monkeypatch):
+    model = make(value="iql").learn(60)
+    before = weights(model)
+    monkeypatch.setattr(PlannerTraining, "_train_values", lambda _: (_ for _ in ()).throw(OSError("full")))
+    with pytest.raises(OSError, match="full"):
+        model.train_planner()
+    th.testing.assert_close(weights(model), before, rtol=0, atol=0)
+
+
+def test_logs_are_learned_from_at_every_age():
+    model = make(delayed(delay=(0, 2))).learn_offline(log(), 3)
+    obs = observe(env=delayed(delay=1, max_delay=2))
+    assert np.isfinite(answer(model, obs)).all()
