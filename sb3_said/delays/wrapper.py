@@ -140,6 +140,8 @@ class DelayedObservationWrapper(
         :param seed: seeds the task and the delay process
         :raises ValueError: when the process draws a delay outside 0..max_delay, or the task's answer is malformed
         """
+        state: Any
+        info: Any
         answer: Any = self.env.reset(seed=seed, options=options)
         state, info = answer if isinstance(answer, tuple) and len(answer) == 2 else (answer, None)
         self._check_answer(state, info)
