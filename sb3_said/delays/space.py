@@ -14,6 +14,7 @@ STATE_KEYS = ("state_history", "state_known")
 UNDELAYED = "undelayed_observation"
 #: Key in ``info`` of what the task was given, where that is not the action sent last.
 EXECUTED = "executed_action"
+#: What to do about a wrapper that changed delayed observations.
 WRAPPER_ORDER = (
     "Wrappers that change observations go below DelayedObservationWrapper, around the task itself; "
     "gymnasium.wrappers.FrameStackObservation and FlattenObservation do there what VecFrameStack does."

@@ -127,6 +127,7 @@ class DelayedReplayBuffer(ReplayBuffer):
             # VecNormalize clips an episode's last one. Where each action takes a time of its own, ages count actions.
             is_state = (np.asarray(done) == 0) & np.array([EXECUTED not in info for info in infos])
             self._check_shown(next_obs, states, next_states, is_state)
+        timeouts = [bool(info.get("TimeLimit.truncated", False)) for info in infos]  # of a flag or an array of one
         started = np.flatnonzero(~continues)
         for env in np.flatnonzero(self.ends[row]).tolist():  # overwritten
             del self.tails[row, env]
@@ -148,7 +149,7 @@ class DelayedReplayBuffer(ReplayBuffer):
         self.rewards[row] = reward
         self.dones[row] = done
         if self.handle_timeout_termination:
-            self.timeouts[row] = [bool(info.get("TimeLimit.truncated", False)) for info in infos]  # or an array of one
+            self.timeouts[row] = timeouts
 
         self._next_states[:] = next_states
         self._next_ages[:] = next_obs["delay"].reshape(self.n_envs) if self.is_delayed else 0
