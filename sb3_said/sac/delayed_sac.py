@@ -112,7 +112,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
         self.policy_kwargs, self.replay_buffer_kwargs = user_kwargs
 
     def _check_env(self, env: GymEnv) -> None:
-        """Refuse what no space tells of an environment, with a ``ValueError``."""
+        """Refuse spaces that are not served, and what no space tells of an environment, with a ``ValueError``."""
+        check_spaces(env.observation_space, env.action_space)
         check_one_max_delay(env)
         vec_normalize = unwrap_vec_normalize(env)  # type: ignore[arg-type]  # None for one that is no VecEnv
         keys = [] if vec_normalize is None or not vec_normalize.norm_obs else vec_normalize.norm_obs_keys or []
@@ -227,3 +228,4 @@ class DelayedSAC(SafeSaveMixin, SAC):
                 **self.replay_buffer_kwargs,
             )
         self.replay_buffer.load_state_dict(state)
+        self.replay_buffer.device = self.device

@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from kill import Kill, Killed
 from sb3_contrib.common.wrappers import TimeFeatureWrapper
 from small_task import Drift, LateDelay, OwnDelay, Simulator, delayed
@@ -429,18 +430,33 @@ def test_a_replay_is_loaded_where_there_is_none(tmp_path):
     model = make(delayed((0, 2)), relabelled_ages=0.2, replay_buffer_kwargs={"handle_timeout_termination": False})
     model.learn(30).save_replay_buffer(tmp_path / "replay")
     before = model.replay_buffer
-    model.replay_buffer = None
+    model.replay_buffer, device = None, model.device
     with pytest.raises(FileNotFoundError):
         model.load_replay_buffer(tmp_path / "another")
     assert model.replay_buffer is None
     model.load_replay_buffer(tmp_path / "replay")
     again = model.replay_buffer
     np.testing.assert_equal(again.state_dict(), before.state_dict())
-    assert (again.relabelled_ages, again.handle_timeout_termination, again.device) == (0.2, False, before.device)
+    assert (again.relabelled_ages, again.handle_timeout_termination, again.device) == (0.2, False, device)
+    model.device = th.device("meta")  # as in SB3, the replay follows its agent
+    model.load_replay_buffer(tmp_path / "replay")
+    assert model.replay_buffer is again and again.device == model.device
+    model.device = again.device = device
     assert model.learn(20, reset_num_timesteps=False).replay_buffer.size() == 50
 
 
 # ---------------------------------------------------------------------------------------------------- refusals
+
+
+class DictTask(gym.ObservationWrapper):
+    """A plain task with a dict observation, which is none of ours."""
+
+    def __init__(self):
+        super().__init__(Drift())
+        self.observation_space = spaces.Dict(vec=self.env.observation_space)
+
+    def observation(self, observation):
+        return {"vec": observation}
 
 
 ABOVE = "go below DelayedObservationWrapper"
@@ -524,6 +540,7 @@ def test_wrappers_of_observations_go_below_ours(wrap):
         ({"policy": "CnnPolicy"}, "CnnPolicy"),
         ({"buffer_size": 3}, "buffer_size"),
         ({"env": VecNormalize(make_vec_env(delayed))}, r"norm_obs_keys=\['observation'\]"),
+        ({"env": VecNormalize(make_vec_env(DictTask))}, "wrap the task in it"),
     ],
 )
 def test_arguments_that_cannot_work_are_refused(kwargs, message):
