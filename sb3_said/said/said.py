@@ -204,6 +204,7 @@ class SAID(DelayedSAC):
     @th.no_grad()
     def _stored_values(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """Return values as the environment's rewards would sum up, of states as windows have them: (B,)."""
+        self.critic.set_training_mode(False)  # until the next update; batch norm must not learn from this
         values = self.policy.value(states.to(self.device), actions.to(self.device)).cpu()
         env = self._vec_normalize_env
         return values if env is None else th.from_numpy(env.unnormalize_reward(values.numpy()))
