@@ -65,6 +65,20 @@ def parse_process(text: str) -> int | tuple[int, int] | DelayProcess:
         ) from error
 
 
+def as_text(delay: Delay | str) -> Delay | str:
+    """Return a delay as :func:`make_process` reads it back from JSON; a user's own process stays the object it is.
+
+    :param delay: as :func:`make_process` takes it
+    """
+    if isinstance(delay, (int, str)):
+        return delay
+    process = make_process(delay)
+    try:
+        return repr(process) if parse_process(repr(process)) == process else delay
+    except ValueError:
+        return delay
+
+
 def _evaluate(node: ast.expr) -> Any:
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in CLASSES:
         keywords = {str(k.arg): _evaluate(k.value) for k in node.keywords}

@@ -123,12 +123,28 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         assert isinstance(space, spaces.Box)  # as check_spaces says
         return np.clip(actions, space.low, space.high), state  # scaling to the bounds may round to beyond them
 
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        try:
+            return super()._predict(observation, deterministic)
+        except ValueError as error:  # of torch's distributions, about a NaN
+            raise ValueError(
+                "The actor's answer is NaN: its weights are damaged, or the observation is so large that it overflows."
+            ) from error
+
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {
             **super()._get_constructor_parameters(),
             "augment_state": self.augment_state,
             "delay_reconciled_critic": self.delay_reconciled_critic,
         }
+
+
+def as_array(given: Any) -> np.ndarray:
+    """Return numbers as an array, those of a tensor from any device, with or without a gradient."""
+    if isinstance(given, th.Tensor):
+        given = given.detach().cpu()
+        given = given.float() if given.is_floating_point() else given  # NumPy has no bfloat16
+    return np.asarray(given)
 
 
 def _as_float32(name: str, given: Any, space: spaces.Space[Any]) -> np.ndarray:
@@ -140,7 +156,7 @@ def _as_float32(name: str, given: Any, space: spaces.Space[Any]) -> np.ndarray:
     :raises ValueError: for what is no array of real numbers, another shape, an empty batch, or entries not finite
     """
     try:
-        array = np.asarray(given)
+        array = as_array(given)
     except ValueError as error:
         raise ValueError(f"{name} cannot be made an array: {error}") from error
     if array.dtype.kind not in "biuf":

@@ -14,6 +14,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import configure_logger
+from stable_baselines3.common.vec_env import unwrap_vec_normalize
 from tqdm.auto import tqdm
 
 from sb3_said.delays.space import ages_of, has_state_history
@@ -100,13 +101,16 @@ class SAID(DelayedSAC):
         policy = getattr(self, "policy", None)
         return self._given_planner_kwargs if policy is None else policy.planner.config.to_dict()
 
-    def _setup_model(self) -> None:
-        vec_normalize = self.get_vec_normalize_env()
-        if has_state_history(self.observation_space) and vec_normalize is not None and vec_normalize.norm_obs:
+    def _check_env(self, env: GymEnv) -> None:
+        super()._check_env(env)
+        vec_normalize = unwrap_vec_normalize(env)  # type: ignore[arg-type]  # None for one that is no VecEnv
+        if has_state_history(env.observation_space) and vec_normalize is not None and vec_normalize.norm_obs:
             raise ValueError(
                 "VecNormalize scales the observation and not the state_history, which must have the same units; use "
                 "VecNormalize(..., norm_obs=False), or leave state_history=False in DelayedObservationWrapper."
             )
+
+    def _setup_model(self) -> None:
         super()._setup_model()
         if self.trained_ages is None and self.env is not None:  # else it was loaded, and check_ages says it
             try:
@@ -214,6 +218,7 @@ class SAID(DelayedSAC):
     @th.no_grad()
     def _stored_values(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """Return values as the environment's rewards would sum up, of states as windows have them: (B,)."""
+        self.critic.set_training_mode(False)  # until the next update; batch norm must not learn from this
         values = self.policy.value(states.to(self.device), actions.to(self.device)).cpu()
         env = self._vec_normalize_env
         return values if env is None else th.from_numpy(env.unnormalize_reward(values.numpy()))
