@@ -21,6 +21,9 @@ def check_task(observation_space: spaces.Space[Any], action_space: spaces.Space[
 
     :raises ValueError: unless observations are a 1-D Box, and actions a 1-D Box with finite bounds that differ
     """
+    for what, space in (("observation", observation_space), ("action", action_space)):
+        if isinstance(space, spaces.Box) and space.shape == (0,):
+            raise ValueError(f"The {what} has no entries, got {space}; there is nothing to learn.")
     if not (isinstance(observation_space, spaces.Box) and len(observation_space.shape) == 1):
         raise ValueError(
             f"Expected a 1-D Box observation, got {observation_space}; wrap the task in "
@@ -78,8 +81,17 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
                 f"got the keys {sorted(observation_space.keys())}; wrap the task in it."
             )
         state_space = observation_space["observation"]
-        max_delay = observation_space["action_history"].shape[0]  # type: ignore[index]  # a Box has a shape
-    return check_task(state_space, action_space)[0], max_delay
+        max_delay = (observation_space["action_history"].shape or (0,))[0]
+    state_box, action_box = check_task(state_space, action_space)
+    if isinstance(observation_space, spaces.Dict):
+        built = delayed_space(state_box, action_box, max_delay, has_state_history(observation_space))
+        shapes = [{key: part.shape for key, part in space.items()} for space in (built, observation_space)]
+        if shapes[0] != shapes[1]:
+            raise ValueError(
+                f"The parts of a delayed observation have the shapes {shapes[1]}, expected {shapes[0]}; leave them as "
+                "DelayedObservationWrapper makes them."
+            )
+    return state_box, max_delay
 
 
 def has_state_history(observation_space: spaces.Space[Any]) -> bool:

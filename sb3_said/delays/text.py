@@ -82,5 +82,6 @@ def _evaluate(node: ast.expr) -> Any:
         if isinstance(value, (int, float)) and not isinstance(value, bool):
             return value
     raise ValueError(
-        f"{ast.unparse(node)!r:.200} is no delay: expected numbers, {', '.join([*CONSTANTS, *CLASSES])}, such as {_EXAMPLE}."
+        f"{ast.unparse(node)!r:.200} is no delay: expected numbers, {', '.join([*CONSTANTS, *CLASSES])}, "
+        f"such as {_EXAMPLE}."
     )

@@ -15,7 +15,7 @@ from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn, Schedul
 
 from sb3_said.delays.space import ages_of, check_spaces, written_ages
 from sb3_said.files.agents import SafeSaveMixin
-from sb3_said.files.archive import load_tree, save_tree
+from sb3_said.files.archive import load_tree, readable, save_tree
 from sb3_said.replay.buffer import DelayedReplayBuffer
 from sb3_said.sac.policies import DelayedSACPolicy
 
@@ -194,6 +194,9 @@ class DelayedSAC(SafeSaveMixin, SAC):
 
         :param path: of the file, or a binary file object
         :param truncate_last_traj: of SB3's ``HerReplayBuffer``, without effect here
-        :raises ValueError: when the file is no replay, or was made with another task, ``buffer_size`` or ``n_envs``
+        :raises SavedFileError: when the file is no replay, is damaged or forged, or was made with another task,
+            ``buffer_size`` or ``n_envs``
         """
-        self.replay_buffer.load_state_dict(load_tree(path))  # type: ignore[arg-type]  # io.BufferedIOBase is IO
+        state = load_tree(path)  # type: ignore[arg-type]  # io.BufferedIOBase is IO
+        with readable(path, explained=(ValueError,)):  # type: ignore[arg-type]
+            self.replay_buffer.load_state_dict(state)

@@ -100,6 +100,25 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         tensors = {key: th.as_tensor(x if is_batch else x[None], device=self.device) for key, x in arrays.items()}
         return tensors if is_delayed else tensors["observation"], is_batch
 
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Answer as SB3 does.
+
+        :raises ValueError: for an answer that is not finite, which no actuator should be sent
+        """
+        actions, state = super().predict(observation, state, episode_start, deterministic)
+        if not np.isfinite(actions).all():
+            raise ValueError(
+                "The networks answer NaN or infinite actions. Their weights, or those of the file they came from, are "
+                "too large: training diverged, or the file was tampered with."
+            )
+        return actions, state
+
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {
             **super()._get_constructor_parameters(),
