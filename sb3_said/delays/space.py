@@ -84,11 +84,13 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
         max_delay = (observation_space["action_history"].shape or (0,))[0]
     state_box, action_box = check_task(state_space, action_space)
     if isinstance(observation_space, spaces.Dict):
-        built = delayed_space(state_box, action_box, max_delay, has_state_history(observation_space))
-        shapes = [{key: part.shape for key, part in space.items()} for space in (built, observation_space)]
-        if shapes[0] != shapes[1]:
+        expected = {"observation": state_box.shape, "action_history": (max_delay, *action_box.shape), "delay": (1,)}
+        if has_state_history(observation_space):
+            expected |= {"state_history": (max_delay, *state_box.shape), "state_known": (max_delay,)}
+        given = {key: part.shape for key, part in observation_space.items()}
+        if given != expected:
             raise ValueError(
-                f"The parts of a delayed observation have the shapes {shapes[1]}, expected {shapes[0]}; leave them as "
+                f"The parts of a delayed observation have the shapes {given}, expected {expected}; leave them as "
                 "DelayedObservationWrapper makes them."
             )
     return state_box, max_delay

@@ -34,6 +34,8 @@ _RANGES: dict[str, tuple[float, float]] = {
     "stats_window_size": (1, 1e9),
     "seed": (0, 2**32 - 1),
 }
+# Of torch's optimizers: counts, and means of squares, whose roots would be no numbers.
+_NEVER_NEGATIVE = ("step", "exp_avg_sq", "max_exp_avg_sq", "square_avg", "sum", "exp_inf")
 
 
 # ---------------------------------------------------------------------------------------------------- arguments
@@ -50,8 +52,8 @@ def check_argument(name: str, value: Any, cls: type) -> None:
     if not _fits(value, next(hints, Any)):
         raise ValueError(f"{name} is {value!r:.100}, which is not of the type that {cls.__name__} declares.")
     low, high = _RANGES.get(name, (-_LARGEST, _LARGEST))
-    number: Any = value[0] if name == "train_freq" and isinstance(value, (tuple, list)) else value
-    if isinstance(number, Real) and not low <= number <= high:
+    number = value[0] if name == "train_freq" and isinstance(value, (tuple, list)) else value
+    if isinstance(number, Real) and not low <= float(number) <= high:
         raise ValueError(f"{name} is {value!r:.100}, expected {low:g}..{high:g}.")
 
 
@@ -71,8 +73,8 @@ def check_numbers(where: str, node: Any) -> None:
             node = float(node)
     if isinstance(node, int) and abs(node) > _LARGEST:
         raise ValueError(f"{where} holds a number of {node.bit_length()} bits.")
-    array: Any = node.numpy(force=True) if isinstance(node, th.Tensor) else node
-    if isinstance(array, (Real, np.ndarray)) and not np.isfinite(array).all():
+    array = node.numpy(force=True) if isinstance(node, th.Tensor) else node
+    if isinstance(array, (Real, np.ndarray)) and not np.isfinite(np.asarray(array)).all():
         raise ValueError(f"{where} holds {array!s:.100}, expected finite numbers.")
 
 
@@ -165,6 +167,7 @@ def check_optimizer_state(where: str, saved: dict[int, Any], optimizer: th.optim
     if not saved:
         return
     twin = copy.deepcopy(optimizer)
+    twin.state.clear()
     for group in twin.param_groups:
         for parameter in group["params"]:
             parameter.grad = th.zeros_like(parameter)
@@ -175,6 +178,8 @@ def check_optimizer_state(where: str, saved: dict[int, Any], optimizer: th.optim
         tensors = {name: value for name, value in own[index].items() if isinstance(value, th.Tensor)}
         check_names(f"{where}[{index}]", values, own[index])
         check_tensors(f"{where}[{index}]", {name: values[name] for name in tensors}, tensors)
+        if negative := [name for name in tensors if name in _NEVER_NEGATIVE and (values[name] < 0).any()]:
+            raise SavedFileError(f"its part '{where}[{index}]' does not fit: {negative[0]} has negative entries")
         for name in own[index].keys() - tensors.keys():
             if type(values[name]) is not type(own[index][name]) or not math.isfinite(values[name] or 0):
                 raise SavedFileError(f"its part '{where}[{index}]' does not fit: {name} is {values[name]!r:.50}")

@@ -10,7 +10,12 @@ from small_task import Drift, LateDelay, OwnDelay, delayed
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_said.delays import DelayedObservationWrapper, TotalDelay
-from sb3_said.delays.space import ages_of, check_spaces, has_state_history, written_ages
+from sb3_said.delays.space import ages_of, check_spaces, delayed_space, has_state_history, written_ages
+
+
+def with_parts(**parts):
+    """The space of a delayed task, of 3 numbers and 2 actions, with other parts."""
+    return spaces.Dict({**delayed_space(spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (2,)), 5).spaces, **parts})
 
 
 @pytest.mark.parametrize(
@@ -23,6 +28,11 @@ from sb3_said.delays.space import ages_of, check_spaces, has_state_history, writ
         (spaces.Box(-1, 1, (3,)), spaces.Discrete(2), "1-D Box action with finite bounds"),
         (spaces.Box(-1, 1, (3,)), spaces.Box(-1, np.inf, (2,)), "1-D Box action with finite bounds"),
         (spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (2, 2)), "1-D Box action with finite bounds"),
+        (spaces.Box(-1, 1, (0,)), spaces.Box(-1, 1, (2,)), "The observation has no entries"),
+        (spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (0,)), "The action has no entries"),
+        (with_parts(action_history=spaces.Box(-1, 1, (5, 1))), spaces.Box(-1, 1, (2,)), r"have the shapes .*\(5, 1\)"),
+        (with_parts(action_history=spaces.Box(-1, 1, (10**9, 0))), spaces.Box(-1, 1, (2,)), "expected"),
+        (with_parts(delay=spaces.Box(0, 5, (2,))), spaces.Box(-1, 1, (2,)), r"have the shapes .*\(2,\)"),
     ],
 )
 def test_other_spaces_are_refused_with_a_reason(observation_space, action_space, reason):
