@@ -7,6 +7,7 @@ import warnings
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from kill import Kill, Killed
 from small_task import Drift, LateDelay, OwnDelay, Simulator, delayed
 from stable_baselines3 import SAC
@@ -24,6 +25,7 @@ from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.delays import TotalDelay, UniformDelay
 from sb3_said.delays.space import UNDELAYED
 from sb3_said.files.archive import SavedFileError, save_tree
+from sb3_said.sac.policies import DelayedSACPolicy
 
 AUGMENTED = {"observation", "action_history", "delay"}
 
