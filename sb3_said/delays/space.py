@@ -27,6 +27,9 @@ def check_task(observation_space: spaces.Space[Any], action_space: spaces.Space[
     :raises ValueError: unless observations are a 1-D Box, and actions a 1-D Box with finite bounds that differ; the
         message says how to get there
     """
+    for what, space in (("observation", observation_space), ("action", action_space)):
+        if isinstance(space, spaces.Box) and space.shape == (0,):
+            raise ValueError(f"The {what} has no entries, got {space}; there is nothing to learn.")
     if isinstance(observation_space, spaces.Dict) and set(KEYS) <= set(observation_space.keys()):
         raise ValueError(
             "The task is in a DelayedObservationWrapper already. One wrapper gives every delay: "
@@ -133,18 +136,30 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
                 f"gymnasium.wrappers.FlattenObservation where it has a dict of its own. {WRAPPER_ORDER}"
             )
         state_space = observation_space["observation"]
-        max_delay = observation_space["action_history"].shape[0]  # type: ignore[index]  # a Box has a shape
+        max_delay = (observation_space["action_history"].shape or (0,))[0]
     state_box, action_box = check_task(state_space, action_space)
     if isinstance(observation_space, spaces.Dict):
-        unchanged = delayed_space(state_box, action_box, max_delay, has_state_history(observation_space))
-        for key, box in unchanged.items():
-            is_state = key in ("observation", "state_history")  # whose bounds VecNormalize may set
-            given = observation_space[key]
-            if given.shape != box.shape or not (is_state or given == box):
-                raise ValueError(
-                    f"{key} was changed to {given}, where DelayedObservationWrapper gives {box}. {WRAPPER_ORDER}"
-                )
+        _check_parts(observation_space, state_box, action_box, max_delay)
     return state_box, max_delay
+
+
+def _check_parts(space: spaces.Dict, state_box: spaces.Box, action_box: spaces.Box, max_delay: int) -> None:
+    """:raises ValueError: for a part of a delayed space that ``DelayedObservationWrapper`` does not give"""
+    shapes = {"observation": state_box.shape, "action_history": (max_delay, *action_box.shape), "delay": (1,)}
+    if has_state_history(space):
+        shapes |= {"state_history": (max_delay, *state_box.shape), "state_known": (max_delay,)}
+    for key, shape in shapes.items():  # before a space of max_delay is built, which may be 1e9
+        if space[key].shape != shape:
+            raise ValueError(
+                f"{key} was changed to {space[key]}, where DelayedObservationWrapper gives the shape {shape}. "
+                f"{WRAPPER_ORDER}"
+            )
+    for key, box in delayed_space(state_box, action_box, max_delay, has_state_history(space)).items():
+        is_state = key in ("observation", "state_history")  # whose bounds VecNormalize may set
+        if not is_state and space[key] != box:
+            raise ValueError(
+                f"{key} was changed to {space[key]}, where DelayedObservationWrapper gives {box}. {WRAPPER_ORDER}"
+            )
 
 
 def has_state_history(observation_space: spaces.Space[Any]) -> bool:

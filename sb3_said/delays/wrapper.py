@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_said.delays.combined import TotalDelay
-from sb3_said.delays.processes import Delay, as_process, checked_count
+from sb3_said.delays.processes import LARGEST_DELAY, Delay, as_process, checked_count
 from sb3_said.delays.receivers import RECEIVERS, Actuator
 from sb3_said.delays.space import EXECUTED, UNDELAYED, check_task, delayed_space, scale_action
 from sb3_said.delays.text import age_range, as_text, make_process
@@ -98,7 +98,8 @@ class DelayedObservationWrapper(
         self.process = make_process(delay)
         if action_delay != 0:
             self.process = TotalDelay(self.process, make_process(action_delay))
-        self.max_delay = checked_count("max_delay", self.process.max_delay if max_delay is None else max_delay, 0)
+        longest = self.process.max_delay if max_delay is None else max_delay
+        self.max_delay = checked_count("max_delay", longest, 0, LARGEST_DELAY)
         if self.max_delay < self.process.max_delay:
             raise ValueError(f"max_delay={max_delay} is smaller than the largest delay {self.process.max_delay}.")
         if receiver not in RECEIVERS:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from pathlib import Path
 from typing import Any
@@ -103,6 +104,11 @@ def restore_training(model: SafeSaveMixin, path: str | Path, callback: BaseCallb
                 f"in the run VecNormalize normalised {', '.join(state['vec_normalize']) or 'nothing'}, in this model's "
                 f"environment {', '.join(statistics) or 'nothing'}; resume with the environment of the run"
             )
+        for name, rms in statistics.items():
+            _check_statistics(name, state["vec_normalize"][name], rms)
+        for kept in state["evaluations"]:
+            _check_evaluation(kept)
+        _check_random_state(state["random"])
         restore_agent(model, state)
         replay_buffer.load_state_dict(state["replay_buffer"])
         for name, rms in statistics.items():
@@ -132,17 +138,61 @@ def random_state() -> dict[str, Any]:
 def restore_random_state(state: dict[str, Any]) -> None:
     """Restore what ``random_state`` returned.
 
-    :raises SavedFileError: for a position that NumPy's generator never has, which would crash the process
+    :raises SavedFileError: for a state that NumPy's generator never has, which would crash the process
     """
-    version, internal, gauss = state["python"]
-    name, keys, position, *rest = state["numpy"]
-    if name != "MT19937" or type(position) is not int or not 0 <= position <= 624:
-        raise SavedFileError(f"NumPy's random state is {name} at position {position}, expected MT19937 at 0..624")
+    _check_random_state(state)
+    (version, internal, gauss), (name, keys, *rest) = state["python"], state["numpy"]
     random.setstate((version, tuple(internal), gauss))
-    np.random.set_state((name, keys, position, *rest))
+    np.random.set_state((name, keys, *rest))
     th.set_rng_state(state["torch"])
     if "cuda" in state and th.cuda.is_available():
         th.cuda.set_rng_state_all(state["cuda"])
+
+
+def _check_random_state(state: dict[str, Any]) -> None:
+    """:raises SavedFileError: for states that no generator has; their own checks let some pass"""
+    version, internal, gauss = state["python"]
+    random.Random().setstate((version, tuple(internal), gauss))  # raises, and no global generator has changed yet
+    name, keys, position, has_gauss, cached = state["numpy"]
+    if name != "MT19937" or type(position) is not int or not 0 <= position <= 624:
+        raise SavedFileError(f"NumPy's random state is {name!s:.20} at position {position!s:.20}, expected 0..624")
+    if not isinstance(keys, np.ndarray) or (keys.dtype, keys.shape) != (np.uint32, (624,)):
+        raise SavedFileError("NumPy's random state is not of 624 numbers")
+    if has_gauss not in (0, 1) or not all(x is None or _is_finite(x) for x in (gauss, cached)):
+        raise SavedFileError("a random state keeps a number that is not finite for its next draw")
+    probe = th.Generator()
+    probe.set_state(state["torch"])
+    if not th.randn(2, generator=probe, dtype=th.float64).isfinite().all():
+        raise SavedFileError("torch's random state draws numbers that are not finite")
+
+
+def _check_statistics(name: str, saved: list[Any], own: RunningMeanStd) -> None:
+    """:raises SavedFileError: for statistics of VecNormalize of another shape, or that scale by no number"""
+    mean, var, count = saved
+    for part, like in ((mean, own.mean), (var, own.var)):
+        if (
+            np.shape(part) != np.shape(like)
+            or not np.isfinite(part).all()
+            or np.any(np.asarray(part) < 0) & (part is var)
+        ):
+            raise SavedFileError(f"its statistics of {name} do not fit: {part!s:.100}")
+    if not _is_finite(count) or count < 0:
+        raise SavedFileError(f"its statistics of {name} do not fit: of {count!s:.20} numbers")
+
+
+def _check_evaluation(saved: dict[str, Any]) -> None:
+    """:raises SavedFileError: for evaluations other than an EvalCallback's"""
+    best, results = saved["best_mean_reward"], [saved[name] for name in _EVALUATION[2:]]
+    if type(saved["n_calls"]) is not int or type(best) is not float or best != best:
+        raise SavedFileError(f"an evaluation has n_calls {saved['n_calls']!s:.20} and the best mean {best!s:.20}")
+    if any(type(rows) is not list or len(rows) != len(results[0]) for rows in results):
+        raise SavedFileError("evaluations differ in how many they are")
+    if any(np.asarray(rows).dtype.kind not in "if" for rows in results if rows):
+        raise SavedFileError("evaluations hold more than numbers")
+
+
+def _is_finite(x: Any) -> bool:
+    return type(x) in (int, float) and math.isfinite(x)
 
 
 def _replay_buffer(model: OffPolicyAlgorithm) -> Any:

@@ -13,9 +13,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_said.delays.space import EXECUTED, UNDELAYED, WRAPPER_ORDER, check_spaces
 from sb3_said.replay.checks import check_finite, check_order, true_states
+from sb3_said.replay.stored import ROW_ARRAYS, check_stored
 from sb3_said.replay.windows import Windows, WindowSource
-
-_ROW_ARRAYS = ("observations", "actions", "rewards", "dones", "timeouts", "ages", "steps", "ends")
 
 
 class DelayedReplayBuffer(ReplayBuffer):
@@ -378,32 +377,22 @@ class DelayedReplayBuffer(ReplayBuffer):
             "tail_places": np.array([*self.tails], np.int64).reshape(-1, 2),
             "tail_states": np.array([state for state, _ in self.tails.values()], np.float32),
             "tail_ages": np.array([age for _, age in self.tails.values()], np.int16),
-            **{name: getattr(self, name)[: self.size()] for name in _ROW_ARRAYS},
+            **{name: getattr(self, name)[: self.size()] for name in ROW_ARRAYS},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what ``state_dict`` returned.
+        """Restore what ``state_dict`` returned; nothing changes unless all of it fits.
 
-        :raises ValueError: when it came from a buffer of another shape
+        :raises ValueError: when it came from a buffer of another shape, or holds what no buffer stores
         """
-        size, space, expected = len(state["rewards"]), self.observation_space, state["expected"]
-        fits = size == self.buffer_size if state["full"] else size == state["pos"] <= self.buffer_size
-        fits = fits and all(state[name].shape[1:] == getattr(self, name).shape[1:] for name in _ROW_ARRAYS)
-        if expected is not None:  # the observation that would continue the replay is of this buffer's task
-            boxes = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
-            sizes = {key: self.n_envs * int(np.prod(box.shape)) for key, box in boxes.items()}  # type: ignore[arg-type]  # Boxes
-            fits = fits and sizes == {key: x.size for key, x in expected.items()}
-        if not fits:
-            raise ValueError(
-                f"A stored replay of shape {state['observations'].shape} does not fit a buffer of shape "
-                f"{self.observations.shape}; use the buffer_size, n_envs, task and max_delay it was made with."
-            )
-        self.pos, self.full, self._expected = state["pos"], state["full"], expected
+        size = len(state["rewards"])
+        check_stored(self, state)
+        self.pos, self.full, self._expected = state["pos"], state["full"], state["expected"]
         self._next_states, self._next_ages = state["next_states"].copy(), state["next_ages"].copy()
         places = map(tuple, state["tail_places"].tolist())
         self.tails = dict(
             zip(places, zip(state["tail_states"].copy(), state["tail_ages"].tolist(), strict=True), strict=True)
         )
-        for name in _ROW_ARRAYS:
+        for name in ROW_ARRAYS:
             getattr(self, name)[:size] = state[name]
         self.ends[size:] = False  # of whatever was stored before

@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from sb3_said.delays.space import ages_of, check_one_max_delay, check_spaces, written_ages
 from sb3_said.files.agents import SafeSaveMixin
-from sb3_said.files.archive import load_tree, save_tree
+from sb3_said.files.archive import load_tree, readable, save_tree
 from sb3_said.replay.buffer import DelayedReplayBuffer
 from sb3_said.sac.policies import DelayedSACPolicy, as_array
 
@@ -226,7 +226,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
 
         :param path: of the file, or a binary file object
         :param truncate_last_traj: of SB3's ``HerReplayBuffer``, without effect here
-        :raises ValueError: when the file is no replay, or was made with another task, ``buffer_size`` or ``n_envs``
+        :raises SavedFileError: when the file is no replay, is damaged or forged, or was made with another task,
+            ``buffer_size`` or ``n_envs``
         """
         state = load_tree(path)  # type: ignore[arg-type]  # io.BufferedIOBase is IO
         if self.replay_buffer is None:
@@ -239,5 +240,6 @@ class DelayedSAC(SafeSaveMixin, SAC):
                 relabelled_ages=self.relabelled_ages,
                 **self.replay_buffer_kwargs,
             )
-        self.replay_buffer.load_state_dict(state)
+        with readable(path, explained=(ValueError,)):  # type: ignore[arg-type]
+            self.replay_buffer.load_state_dict(state)
         self.replay_buffer.device = self.device

@@ -16,6 +16,11 @@ from sb3_said.delays.space import UNDELAYED, check_spaces
 from sb3_said.files.agents import SafePolicyMixin
 from sb3_said.sac.extractors import KeyExtractor, StateAugmentedExtractor
 
+NOT_FINITE = (
+    "The action is not finite: the observation is far larger than those of training, or the agent's weights are "
+    "damaged, or its training diverged."
+)
+
 
 class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
     """SAC's policy for delayed observations; for a plain 1-D Box it computes what SB3's ``SACPolicy`` does.
@@ -115,10 +120,7 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         if not np.isfinite(actions).all():
             parts = observation.values() if isinstance(observation, dict) else [observation]
             largest = max(float(np.abs(part).max(initial=0.0)) for part in parts)
-            raise ValueError(
-                f"The action is not finite. The largest entry of the observation is {largest:.3g}: keep it near what "
-                "the agent was trained on; else the agent's own weights are not finite, and its training diverged."
-            )
+            raise ValueError(f"{NOT_FINITE} The largest entry of the observation is {largest:.3g}.")
         space = self.action_space
         assert isinstance(space, spaces.Box)  # as check_spaces says
         return np.clip(actions, space.low, space.high), state  # scaling to the bounds may round to beyond them
@@ -127,9 +129,7 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         try:
             return super()._predict(observation, deterministic)
         except ValueError as error:  # of torch's distributions, about a NaN
-            raise ValueError(
-                "The actor's answer is NaN: its weights are damaged, or the observation is so large that it overflows."
-            ) from error
+            raise ValueError(NOT_FINITE) from error
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {

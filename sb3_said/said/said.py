@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import unwrap_vec_normalize
 from tqdm.auto import tqdm
 
 from sb3_said.delays.space import ages_of, has_state_history
-from sb3_said.files.archive import load_tree, save_tree
+from sb3_said.files.archive import load_tree, readable, save_tree
 from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.planner.trainer import PlannerTrainer, worse_than_regression
 from sb3_said.planner.values import returns_to_go
@@ -260,8 +260,9 @@ class SAID(DelayedSAC):
         data = {"num_timesteps": self.num_timesteps, "replay": zlib.crc32(replay.data)}
         if checkpoint is not None and checkpoint.exists():
             state = load_tree(checkpoint)
-            if {key: state[key] for key in data} == data:
-                trainer.load_state_dict(state["trainer"])
+            with readable(checkpoint, explained=(ValueError,)):
+                if {key: state[key] for key in data} == data:
+                    trainer.load_state_dict(state["trainer"])
 
         def on_update(trainer: PlannerTrainer) -> None:
             bar.update()

@@ -14,7 +14,19 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_said.delays import DelayedObservationWrapper, TotalDelay, scale_action, unscale_action
-from sb3_said.delays.space import ages_of, check_one_max_delay, check_spaces, has_state_history, written_ages
+from sb3_said.delays.space import (
+    ages_of,
+    check_one_max_delay,
+    check_spaces,
+    delayed_space,
+    has_state_history,
+    written_ages,
+)
+
+
+def with_parts(**parts):
+    """The space of a delayed task, of 3 numbers and 2 actions, with other parts."""
+    return spaces.Dict({**delayed_space(spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (2,)), 5).spaces, **parts})
 
 
 @pytest.mark.parametrize(
@@ -29,6 +41,11 @@ from sb3_said.delays.space import ages_of, check_one_max_delay, check_spaces, ha
         (spaces.Box(-1, 1, (3,)), spaces.MultiDiscrete([2, 2]), "discrete actions is not supported"),
         (spaces.Box(-1, 1, (3,)), spaces.Box(-1, np.inf, (2,)), "must be finite.*TransformAction"),
         (spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (2, 2)), r"1-D Box action.*action\.reshape"),
+        (spaces.Box(-1, 1, (0,)), spaces.Box(-1, 1, (2,)), "The observation has no entries"),
+        (spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (0,)), "The action has no entries"),
+        (with_parts(action_history=spaces.Box(-1, 1, (5, 1))), spaces.Box(-1, 1, (2,)), r"gives the shape \(5, 2\)"),
+        (with_parts(action_history=spaces.Box(-1, 1, (10**9, 0))), spaces.Box(-1, 1, (2,)), "gives the shape"),
+        (with_parts(delay=spaces.Box(0, 5, (2,))), spaces.Box(-1, 1, (2,)), r"delay was changed to .*\(2,\)"),
     ],
 )
 def test_other_spaces_are_refused_with_a_reason(observation_space, action_space, reason):

@@ -469,6 +469,8 @@ def test_max_delay_below_the_delay_is_refused():
     for bad in (4.5, "5", -1):
         with pytest.raises(ValueError, match=f"max_delay is a whole number >= 0, got {bad}"):
             DelayedObservationWrapper(LoggedTask(), 0, max_delay=bad)
+    with pytest.raises(ValueError, match="max_delay is at most 10000, got 1000000000"):
+        DelayedObservationWrapper(LoggedTask(), 0, max_delay=10**9)
 
 
 def test_an_unknown_receiver_is_refused():

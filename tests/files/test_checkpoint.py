@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.files import checkpoint
-from sb3_said.files.archive import load_tree, save_tree
+from sb3_said.files.archive import SavedFileError, load_tree, save_tree
 from sb3_said.files.checkpoint import (
     CHECKPOINT_NAME,
     TrainingCheckpointCallback,
@@ -301,8 +301,21 @@ def test_other_replay_buffers_are_refused():
         (("parameters", "actor.optimizer", 0, "exp_avg"), th.zeros(7)),
         (("parameters", "actor.optimizer", 99), {}),
         (("replay_buffer", "rewards"), 3),
+        (("replay_buffer", "ages"), np.full((50, 1), 100, np.int16)),
         (("vec_normalize", "return"), 1),
+        (("vec_normalize", "return", 0), np.array(np.nan)),
+        (("vec_normalize", "return", 1), np.array(-1.0)),
+        (("vec_normalize", "obs/observation", 0), np.zeros(7)),
+        (("vec_normalize", "obs/observation", 2), float("inf")),
         (("evaluations",), [{}]),
+        (("evaluations", 0, "n_calls"), "3"),
+        (("evaluations", 0, "best_mean_reward"), float("nan")),
+        (("evaluations", 0, "evaluations_results"), [["a"]]),
+        (("evaluations", 0, "evaluations_timesteps"), [1, 2, 3]),
+        (("random", "python", 2), float("nan")),
+        (("random", "python", 2), "a"),
+        (("random", "numpy", 4), float("inf")),
+        (("random", "numpy", 2), 10**9),  # once a segmentation fault
     ],
     ids=str,
 )
@@ -314,7 +327,16 @@ def test_forged_checkpoints_are_refused(place, value, tmp_path):
     part = state
     for key in folders:
         part = part[key]
-    part[last] = value
+    if isinstance(part, tuple):
+        above = state["random"]
+        above[folders[-1]] = (*part[:last], value, *part[last + 1 :])
+    else:
+        part[last] = value
     save_tree(path, state)
-    with pytest.raises(ValueError):
-        restore_training(make(env()), path, callback)
+    model, kept = make(env()), random_state()
+    before = everything(model)
+    with pytest.raises(SavedFileError, match="Cannot load"):
+        restore_training(model, path, callback)
+    assert_same(random_state(), kept)
+    if folders[:1] != ["replay_buffer"]:  # which is taken over after the agent
+        assert_same(everything(model), before)

@@ -609,3 +609,42 @@ def test_a_single_action_is_not_broadcast_over_many():
     one.add(np.zeros((1, 3)), np.ones((1, 3)), np.zeros((1, 1)), np.zeros(1), np.zeros(1), [{}])
     with pytest.raises(ValueError, match="does not fit"):
         three.load_state_dict(one.state_dict())
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("pos", lambda pos: -1),
+        ("pos", lambda pos: float(pos)),
+        ("full", lambda full: 1),
+        ("observations", lambda x: np.where(x == x, np.nan, x)),
+        ("observations", lambda x: x.astype(np.float64)),
+        ("rewards", lambda x: x + np.float32(np.inf)),
+        ("ages", lambda x: x - np.int16(1000)),
+        ("ages", lambda x: x + np.int16(1000)),
+        ("next_ages", lambda x: x + np.int16(1000)),
+        ("next_states", lambda x: x[:, :1]),
+        ("steps", lambda x: -1 - x),
+        ("dones", lambda x: x + np.float32(0.5)),
+        ("ends", lambda x: ~x),
+        ("ends", lambda x: x.view(np.int8)),
+        ("tail_places", lambda x: x + 10**6),
+        ("tail_places", lambda x: np.concatenate([x[:1], x[:-1]])),
+        ("tail_states", lambda x: x[:-1]),
+        ("tail_ages", lambda x: x[:0]),
+        ("expected", lambda x: {key: value * np.nan for key, value in x.items()}),
+        ("expected", lambda x: {key: value.astype(str) for key, value in x.items()}),
+    ],
+)
+def test_what_no_buffer_stores_is_refused_and_nothing_changes(name, change):
+    players = Player(max_length=4), Player(max_length=4)
+    state = fill(make_buffer(players[0]), players[0].play(30)).state_dict()
+    assert state["full"] and len(state["tail_places"]) > 2
+    other = fill(make_buffer(players[1]), players[1].play(7))
+    before = copy.deepcopy(other.state_dict())
+    with pytest.raises(ValueError, match=r"A stored replay|The stored"):
+        other.load_state_dict({**state, name: change(state[name])})
+    for key, value in other.state_dict().items():
+        np.testing.assert_equal(value, before[key])
+    other.load_state_dict(state)
+    np.testing.assert_equal(other.state_dict(), state)

@@ -27,6 +27,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFram
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.delays import TotalDelay, UniformDelay
 from sb3_said.delays.space import UNDELAYED
+from sb3_said.files.archive import SavedFileError, save_tree
+from sb3_said.sac.policies import DelayedSACPolicy
 
 AUGMENTED = {"observation", "action_history", "delay"}
 
@@ -424,6 +426,17 @@ def test_replay_is_saved_without_pickle(tmp_path):
     save_to_pkl(tmp_path / "pickled.pkl", model.replay_buffer)
     with pytest.raises(ValueError, match="holds a pickle"):
         make().load_replay_buffer(tmp_path / "pickled.pkl")
+    for state in ({}, [], {**model.replay_buffer.state_dict(), "rewards": 3}):
+        save_tree(tmp_path / "forged", state)
+        with pytest.raises(SavedFileError, match="Cannot load"):
+            other.load_replay_buffer(tmp_path / "forged")
+
+
+def test_an_answer_that_is_not_finite_is_refused():
+    wide = spaces.Box(-3e38, 3e38, (1,), np.float32)  # finite, but high - low is not
+    policy = DelayedSACPolicy(spaces.Box(-1, 1, (2,)), wide, lambda _: 1e-3, net_arch=[8])
+    with np.errstate(all="ignore"), pytest.raises(ValueError, match="action is not finite"):
+        policy.predict(np.zeros(2, np.float32), deterministic=True)
 
 
 def test_a_replay_is_loaded_where_there_is_none(tmp_path):

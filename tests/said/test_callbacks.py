@@ -12,6 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import KVWriter, Logger
 
 from sb3_said import SAID, DelayedObservationWrapper, PlannerTrainingCallback
+from sb3_said.files.archive import SavedFileError, load_tree, save_tree
 from sb3_said.files.checkpoint import TrainingCheckpointCallback, restore_training
 from sb3_said.planner import InpaintingPlanner
 from sb3_said.planner.trainer import PlannerTrainer
@@ -363,6 +364,16 @@ def test_a_checkpoint_of_other_settings_is_refused(tmp_path):
     make().learn(40, PlannerTrainingCallback(folder=tmp_path))
     with pytest.raises(ValueError, match="gradient_steps was 6 and is now 7"):
         make(planner_gradient_steps=7).learn(40, PlannerTrainingCallback(folder=tmp_path))
+
+
+@pytest.mark.parametrize("state", [{}, [], {"trainer": {}}], ids=str)
+def test_a_checkpoint_of_something_else_is_refused(state, tmp_path):
+    model = make().learn(40, PlannerTrainingCallback(folder=tmp_path))
+    path = tmp_path / PLANNER_CHECKPOINT_NAME
+    kept = load_tree(path)
+    save_tree(path, state if state != {"trainer": {}} else {**kept, **state})
+    with pytest.raises(SavedFileError, match="Cannot load"):
+        model.train_planner(folder=tmp_path)
 
 
 def test_unknown_intervals_are_refused_before_the_training():

@@ -133,5 +133,5 @@ def test_an_expert_whose_networks_overflow_says_so(cls, deterministic):
     with th.no_grad():
         agent.policy.actor.latent_pi[0].weight.mul_(50.0)
     obs = {**{key: value[0] for key, value in GOOD.items()}, "observation": np.array([3e38, -3e38], np.float32)}
-    with pytest.raises(ValueError, match=r"actor's answer is NaN.*overflows"):
+    with pytest.raises(ValueError, match=r"action is not finite"):
         agent.predict(obs, deterministic=deterministic)

@@ -160,6 +160,11 @@ def test_a_resume_keeps_what_it_is_not_told_to_change(tmp_path: Path) -> None:
     assert "--resume" not in manager.read_arguments(run)
 
 
+def test_a_folder_without_a_run_is_an_error_and_no_exit(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"holds no run: .*train_args\.json is missing"):
+        manager.read_arguments(tmp_path)
+
+
 def lengths(monitor: Path) -> list[int]:
     """Return the lengths of the episodes in a file of SB3's Monitor."""
     return [int(row.split(",")[1]) for row in monitor.read_text().splitlines()[2:]]
