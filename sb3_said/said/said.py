@@ -297,20 +297,19 @@ class SAID(DelayedSAC):
                 print(f"Planner training interrupted after {trainer.n_updates} of {total} updates; it {outcome}.")
                 trial_episodes = 0
         if trainer.n_updates > 0:
-            self.policy.planner_updates.fill_(float(trainer.n_updates))
-            if is_done:
-                self._settle_answer(trial_episodes, progress_bar)
+            self._settle_answer(trainer.n_updates, trial_episodes if is_done else 0, progress_bar)
         if not is_done:
             raise KeyboardInterrupt
         self._planner_trained_at = self.num_timesteps
 
-    def _settle_answer(self, n_episodes: int | None, progress_bar: bool) -> None:
+    def _settle_answer(self, n_updates: int, n_episodes: int | None, progress_bar: bool) -> None:
         """Let the newly trained planner answer, or whoever is better in a trial."""
+        self.policy.planner_updates.fill_(float(n_updates))
         n_episodes = self.planner_trial_episodes if n_episodes is None else n_episodes
         self.set_answer("planner")
         if n_episodes > 0 and self.env is not None:
             returns = let_the_better_answer(self, n_episodes, progress_bar)
-            self._log_planner(returns, int(self.policy.planner_updates))
+            self._log_planner(returns, n_updates)
 
     def _log_planner(self, values: dict[str, float], n_updates: int) -> None:
         """Write a row with a logger of its own, to the same places: the user's keeps what it holds for its next row."""
