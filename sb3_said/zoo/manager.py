@@ -135,9 +135,7 @@ class DelayedExperimentManager(ExperimentManager):
         The run's settings on disk keep the delay that the agent is for.
         """
         if self.run.expert_delay is not None:
-            self.env_wrapper = make_wrapper(
-                with_delay(self._own_wrappers, self.run.expert_delay, self.run.delay),
-            )
+            self.env_wrapper = make_wrapper(with_delay(self._own_wrappers, self.run.expert_delay, self.run.delay))
         with shielded():
             return super().create_envs(*args, **kwargs)
 
