@@ -78,7 +78,7 @@ def plot_learning_curve(run: str | Path, ax: Axes | None = None, window: int = 2
     Its colours are none of a planner's and an expert's in :func:`plot_returns`, so that both fit into one figure.
 
     :param run: folder with ``*.monitor.csv`` (SB3's Monitor), ``evaluations.npz`` (SB3's EvalCallback), or both; of a
-        run of SAID the latter are the planner's, and those of the expert lie in ``expert/``
+        run of SAID the latter are the trained agent's, and those of the expert lie in ``expert/``
     :param ax: to draw on; a new figure by default
     :param window: training episodes in the running mean
     :raises ValueError: when the folder holds neither file
@@ -94,7 +94,7 @@ def plot_learning_curve(run: str | Path, ax: Axes | None = None, window: int = 2
         mean = np.convolve(returns, np.full(window, 1 / window), mode="valid")
         ax.plot(steps, returns, ".", color=COLORS[2], alpha=0.2, markersize=3, markeredgewidth=0)
         ax.plot(steps[window - 1 :], mean, color=COLORS[2], label=f"training, mean of {window} episodes")
-    own = "evaluation of the planner" if files[0].is_file() else "evaluation"
+    own = "evaluation of the trained agent" if files[0].is_file() else "evaluation"
     for path, name, color in zip(files, ("evaluation of the expert", own), (COLORS[3], COLORS[4]), strict=True):
         if path.is_file():
             with np.load(path) as file:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,8 @@ EXPERT_FOLDER = "expert"  # in the run's: what EvalCallback wrote while the expe
 def evaluate_answer(model: SAID, like: EvalCallback, folder: Path, stopping: Stopping) -> None:
     """Play a trained agent as it answers, and add the returns to ``evaluations.npz`` in the run's folder.
 
-    The first row, of step 0, holds NaN: there was no planner yet, and rl_zoo3's plots need two rows. ``best_model.zip``
-    is the agent of the row with the highest mean.
+    Beside SB3's arrays, ``answers`` says who answered. The first row, of step 0, holds NaN: there was no planner yet,
+    and rl_zoo3's plots need two rows. ``best_model.zip`` is the agent of the row with the highest mean.
 
     :param like: whose environment and number of episodes are taken
     :param stopping: ends it with a ``KeyboardInterrupt``
@@ -34,23 +35,24 @@ def evaluate_answer(model: SAID, like: EvalCallback, folder: Path, stopping: Sto
         if stopping.is_asked:
             raise KeyboardInterrupt
 
-    returns, lengths = evaluate_policy(
+    played: Any = evaluate_policy(
         model, like.eval_env, like.n_eval_episodes, like.deterministic, callback=on_step, return_episode_rewards=True
     )
-    path, now = folder / "evaluations.npz", model.num_timesteps
-    rows: dict[int, tuple[Any, Any]] = {0: ([np.nan] * len(returns), [0] * len(returns))}  # type: ignore[arg-type]
+    returns, lengths = played
+    path, now, who = folder / "evaluations.npz", model.num_timesteps, model.policy.who_answers
+    rows: dict[int, Sequence[Any]] = {0: ([np.nan] * len(returns), [0] * len(returns), "")}
     if path.exists():
         with np.load(path) as file:
-            old = [file[name].tolist() for name in ("timesteps", "results", "ep_lengths")]
+            old = [file[name].tolist() for name in ("timesteps", "results", "ep_lengths", "answers")]
         # An evaluation of as many episodes alone can stand in one array with this.
-        rows |= {t: (r, n) for t, r, n in zip(*old, strict=True) if 0 < t < now and len(r) == len(returns)}  # type: ignore[arg-type]
-    best = max((np.mean(row) for step, (row, _) in rows.items() if step > 0), default=-np.inf)
-    rows[now] = (returns, lengths)
+        rows |= {t: row for t, *row in zip(*old, strict=True) if 0 < t < now and len(row[0]) == len(returns)}
+    best = max((np.mean(row[0]) for step, row in rows.items() if step > 0), default=-np.inf)
+    rows[now] = (returns, lengths, who)
     with replacing(path) as file:
-        results, ep_lengths = zip(*rows.values(), strict=True)
-        np.savez(file, timesteps=list(rows), results=results, ep_lengths=ep_lengths)
-    who, mean = model.policy.who_answers, float(np.mean(returns))
-    print(f"Evaluation of the {who}: mean return {mean:.2f} over {len(returns)} episodes")  # type: ignore[arg-type]
+        results, ep_lengths, answers = zip(*rows.values(), strict=True)
+        np.savez(file, timesteps=list(rows), results=results, ep_lengths=ep_lengths, answers=answers)
+    mean = float(np.mean(returns))
+    print(f"Evaluation of the {who}: mean return {mean:.2f} over {len(returns)} episodes")
     model.logger.record("eval/answer_mean_reward", mean)
     model.logger.record("eval/answer_mean_ep_length", float(np.mean(lengths)))
     model.logger.dump(model.num_timesteps)

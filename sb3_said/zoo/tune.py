@@ -40,7 +40,7 @@ examples:
   sb3-said tune --run logs/said/Hopper-v5-delay4-seed1_1 --depths 2 --gradient-steps 5000 --episodes 10 --output look
 
   # how the critics choose: the larger the factor, the more the best candidate decides; 100 hardly asks another
-  sb3-said tune --run logs/said/Hopper-v5-delay4_1 --depths 2 --temperatures 0.5 1 --choice-factors 0.3 1 3 100
+  sb3-said tune --run logs/said/Hopper-v5-delay4-seed1_1 --depths 2 --temperatures 0.5 1 --choice-factors 0.3 1 3 100
 
   # any temperature from 0 to 1, fewer denoising steps, in a data base
   sb3-said tune --run logs/said/Hopper-v5-delay4-seed1_1 --sampler tpe --n-trials 30 --sampling-steps 1 2 5 \\

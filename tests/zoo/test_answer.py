@@ -29,7 +29,7 @@ EVALUATED = ("--eval-freq", "100", "--eval-episodes", "2")
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("logs")
-    planner = ("planner_gradient_steps:3", f"planner_kwargs:{PLANNER}")
+    planner = ("planner_gradient_steps:3", "planner_trial_episodes:0", f"planner_kwargs:{PLANNER}")
     train_run(folder, "said", *planner, options=EVALUATED)
     train_run(folder, "sadr", options=EVALUATED)
     return folder
@@ -45,6 +45,8 @@ def test_planner_and_expert_are_told_apart(logs: Path) -> None:
     expert, planner = returns_of(said / "expert" / "evaluations.npz"), returns_of(said / "evaluations.npz")
     # The expert is SADR, evaluated as it learns; the planner is evaluated when it has been trained.
     assert expert == returns_of(sadr / "evaluations.npz") and list(expert) == [100, 200]
+    with np.load(said / "evaluations.npz") as file:
+        assert file["answers"].tolist() == ["", "planner"]
     assert list(planner) == [0, 200] and np.isnan(planner[0]).all() and np.isfinite(planner[200]).all()
     best, of_expert = (SAID.load(folder / "best_model.zip", device="cpu") for folder in (said, said / "expert"))
     assert best.policy.planner_is_trained and not of_expert.policy.planner_is_trained
@@ -75,8 +77,10 @@ def test_the_plots_of_rl_zoo3_show_the_planner(
 def test_the_learning_curve_has_both(logs: Path) -> None:
     pytest.importorskip("matplotlib")
     (said,) = (logs / "said").iterdir()
-    lines = {line.get_label(): line.get_xdata().tolist() for line in plot_learning_curve(said).lines[2:]}
-    assert lines == {"evaluation of the expert": [100, 200], "evaluation of the planner": [200]}
+    lines = {
+        line.get_label().partition(",")[0]: line.get_xdata().tolist() for line in plot_learning_curve(said).lines[2:]
+    }
+    assert lines == {"evaluation of the expert": [100, 200], "evaluation of the trained agent": [200]}
 
 
 def test_a_later_planner_is_added_and_the_best_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

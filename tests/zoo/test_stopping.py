@@ -26,7 +26,13 @@ from sb3_said.zoo.stopping import Stopping
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "train.py"
 COMMAND = f"--algo said --env {ENV} --delay 2 --seed 3 --num-threads 1 --eval-freq -1 --device cpu --verbose 0"
-PARAMS = ["learning_starts:50", "buffer_size:400", "planner_gradient_steps:20", f"planner_kwargs:{PLANNER}"]
+PARAMS = [
+    "learning_starts:50",
+    "buffer_size:400",
+    "planner_gradient_steps:20",
+    "planner_trial_episodes:1",
+    f"planner_kwargs:{PLANNER}",
+]
 
 
 def arguments(folder: Path, *more: str) -> list[str]:
