@@ -21,7 +21,7 @@ from sb3_said.zoo import evaluate, manager, over_delays, train, tune
 from sb3_said.zoo.record import WRAPPER
 from sb3_said.zoo.runs import load_run
 
-TINY_PLANNER = f"planner_kwargs:{PLANNER}"
+PLANNED = ("planner_gradient_steps:2", "planner_trial_episodes:0", f"planner_kwargs:{PLANNER}")
 
 
 TIME = "rl_zoo3.wrappers.TimeFeatureWrapper"
@@ -84,7 +84,7 @@ def test_a_run_remembers_the_package_of_its_task(
 ) -> None:
     forget_mine(monkeypatch)
     train_here(tmp_path, f"--algo said --env Mine-v0 --gym-packages mine --delay 1 {QUICK}",
-               "--env-kwargs", "length:5", "-params", "planner_gradient_steps:2", TINY_PLANNER)  # fmt: skip
+               "--env-kwargs", "length:5", "-params", *PLANNED)  # fmt: skip
     run = tmp_path / "said" / "Mine-v0-delay1-seed3_1"
     few = ["--episodes", "2", "--device", "cpu"]
     for play in (

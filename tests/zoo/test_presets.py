@@ -24,7 +24,7 @@ TASKS = ("Ant-v5", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5")
 
 def merged_settings(algo: str, preset: str, env_id: str, delay: Delay, log_folder: Path) -> dict[str, Any]:
     """Return what the command line trains with: the preset over the file's block over the constructors' defaults."""
-    run = Run([], delay, preset, 25_000)
+    run = Run(delay, preset)
     manager = DelayedExperimentManager(run, Namespace(), algo, env_id, str(log_folder), verbose=0, eval_freq=-1)
     cls, flags = ALGORITHMS[algo]
     defaults: dict[str, Any] = {}

@@ -135,7 +135,7 @@ def test_a_run_killed_amid_the_planners_updates_ends_as_if_it_was_not(finished: 
 
 def test_a_given_agent_learns_as_many_steps_as_a_new_one(tmp_path: Path) -> None:
     command, name = "--algo said --env Pendulum-v1 --delay 1 --preset smoke -n 150 --seed 3", "Pendulum-v1.zip"
-    params = ["-params", "learning_starts:100", "planner_gradient_steps:2", TINY_PLANNER]
+    params = ["-params", "learning_starts:100", "planner_gradient_steps:2", "planner_trial_episodes:0", TINY_PLANNER]
     first, second = (tmp_path / "said" / f"Pendulum-v1-delay1-seed3_{k}" for k in (1, 2))
     train_here(tmp_path, command, *params)
     train_here(tmp_path, command, "-i", first / name, *params)
