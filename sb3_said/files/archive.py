@@ -36,7 +36,8 @@ class SavedFileError(ValueError):
 def save_tree(path: PathOrFile, tree: Any, metadata: dict[str, Any] | None = None, kind: str = "tree") -> None:
     """Write nested data that :func:`load_tree` gives back unchanged.
 
-    Arrays are written piece by piece from where they lie. A path is replaced only once the new file is whole.
+    Arrays are written piece by piece from where they lie. A path is written as
+    :func:`~sb3_said.files.atomic.replacing` does it: whole or not at all, also by several processes at a time.
 
     :param path: where to write; missing folders are made. Or a binary file object, open for writing.
     :param tree: dicts (str or int keys), lists and tuples of None, bool, int, float, str, tensors, and NumPy arrays and
@@ -91,6 +92,23 @@ def load_tree(path: PathOrFile, kind: str | None = "tree") -> Any:
         if next(arrays, None) is not None:
             raise SavedFileError("it holds more arrays than its data names")
         return tree
+
+
+def to_json(tree: Any) -> Any:
+    """Return a tree without arrays as a JSON document that :func:`from_json` gives back unchanged.
+
+    :raises ValueError: for an array, and for what :func:`save_tree` does not take
+    """
+    arrays: list[np.ndarray] = []
+    node = _encode(tree, "tree", arrays)
+    if arrays:
+        raise ValueError(f"JSON holds no arrays, but there is one of the shape {arrays[0].shape}.")
+    return node
+
+
+def from_json(node: Any) -> Any:
+    """Read what :func:`to_json` returned, running no code from it."""
+    return _decode(node, iter(()))
 
 
 def load_metadata(path: PathOrFile) -> dict[str, Any]:

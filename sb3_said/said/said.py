@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 import zlib
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -232,6 +233,7 @@ class SAID(DelayedSAC):
         eval_interval: int = 2_000,
         save_interval: int = 1_000,
         trial_episodes: int | None = None,
+        should_stop: Callable[[], bool] | None = None,
     ) -> None:
         """Train the planner anew on the replay buffer, without running the expert; then see who answers better.
 
@@ -248,6 +250,8 @@ class SAID(DelayedSAC):
         :param eval_interval: updates between two measurements of the held-out errors, beside the regression's
         :param save_interval: updates between two checkpoints
         :param trial_episodes: ``planner_trial_episodes`` by default; none are played where there is no environment
+        :param should_stop: asked after every update; where it says so, a checkpoint is written and the training ends
+        :raises KeyboardInterrupt: when ``should_stop`` has ended the training
         :raises ValueError: when the buffer is empty, or the checkpoint is of a training with other settings
         :raises FloatingPointError: when an update was not finite
         """
@@ -264,7 +268,7 @@ class SAID(DelayedSAC):
                 if {key: state[key] for key in data} == data:
                     trainer.load_state_dict(state["trainer"])
 
-        def on_update(trainer: PlannerTrainer) -> None:
+        def on_update(trainer: PlannerTrainer) -> bool:
             bar.update()
             done = trainer.n_updates
             is_end = done == total
@@ -279,8 +283,10 @@ class SAID(DelayedSAC):
                         "undertrained; give it more planner_gradient_steps, or more data.",
                         stacklevel=4,
                     )
-            if checkpoint is not None and (done % save_interval == 0 or is_end):
-                save_tree(checkpoint, {**data, "trainer": trainer.state_dict()})
+            is_stopped = should_stop is not None and should_stop()
+            if checkpoint is not None and (done % save_interval == 0 or is_end or is_stopped):
+                _save_or_warn(checkpoint, {**data, "trainer": trainer.state_dict()})
+            return not is_stopped
 
         if trainer.n_updates < total and not progress_bar and self.verbose == 0:
             print(
@@ -288,24 +294,28 @@ class SAID(DelayedSAC):
                 flush=True,
             )
         with tqdm(total=total, initial=trainer.n_updates, desc="planner", disable=not progress_bar) as bar:
+            is_done = True
             try:
-                trainer.train(callback=on_update)
+                is_done = trainer.train(callback=on_update)
             except KeyboardInterrupt:
                 trainer.hand_over()
                 outcome = "keeps what it learned" if trainer.n_updates > 0 else "stays as it was"
                 print(f"Planner training interrupted after {trainer.n_updates} of {total} updates; it {outcome}.")
                 trial_episodes = 0
         if trainer.n_updates > 0:
-            self.policy.planner_updates.fill_(float(trainer.n_updates))
-            self._settle_answer(self.planner_trial_episodes if trial_episodes is None else trial_episodes, progress_bar)
+            self._settle_answer(trainer.n_updates, trial_episodes if is_done else 0, progress_bar)
+        if not is_done:
+            raise KeyboardInterrupt
         self._planner_trained_at = self.num_timesteps
 
-    def _settle_answer(self, n_episodes: int, progress_bar: bool) -> None:
+    def _settle_answer(self, n_updates: int, n_episodes: int | None, progress_bar: bool) -> None:
         """Let the newly trained planner answer, or whoever is better in a trial."""
+        self.policy.planner_updates.fill_(float(n_updates))
+        n_episodes = self.planner_trial_episodes if n_episodes is None else n_episodes
         self.set_answer("planner")
         if n_episodes > 0 and self.env is not None:
             returns = let_the_better_answer(self, n_episodes, progress_bar)
-            self._log_planner(returns, int(self.policy.planner_updates))
+            self._log_planner(returns, n_updates)
 
     def _log_planner(self, values: dict[str, float], n_updates: int) -> None:
         """Write a row with a logger of its own, to the same places: the user's keeps what it holds for its next row."""
@@ -314,3 +324,15 @@ class SAID(DelayedSAC):
         for key, value in values.items():
             log.record(key, value)
         log.dump(self.num_timesteps + (n_updates if self.planner_train_freq is None else 0))
+
+
+def _save_or_warn(checkpoint: Path, tree: dict[str, Any]) -> None:
+    """Write a checkpoint of the planner; a full disk is no reason to lose the planner itself."""
+    try:
+        save_tree(checkpoint, tree)
+    except OSError as error:
+        warnings.warn(
+            f"The planner's checkpoint could not be written to {checkpoint} ({error}). Training goes on, and the agent "
+            "keeps its planner; make room, so that it can be saved.",
+            stacklevel=5,
+        )

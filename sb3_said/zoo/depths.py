@@ -14,7 +14,7 @@ from stable_baselines3.common.logger import Logger, make_output_format
 from sb3_said.files.archive import load_tree, readable, save_tree
 from sb3_said.files.checks import check_tensors
 from sb3_said.said.said import PLANNER_CHECKPOINT_NAME, SAID
-from sb3_said.zoo.manager import log_suffix
+from sb3_said.zoo.folder import log_suffix
 
 
 class DepthPlanners:

@@ -347,6 +347,26 @@ def test_a_resumed_run_loses_and_repeats_no_training(tmp_path, trainings, save_f
     assert resumed.policy.planner_updates == 6
 
 
+def test_a_stop_amid_one_of_several_trainings_loses_no_update(tmp_path, trainings):
+    asked = []
+
+    def should_stop():
+        asked.append(True)
+        return len(asked) == 4
+
+    checkpointing = TrainingCheckpointCallback(tmp_path, 1000)
+    with pytest.raises(KeyboardInterrupt):
+        make(planner_train_freq=40).learn(
+            60, [checkpointing, PlannerTrainingCallback(folder=tmp_path, should_stop=should_stop)]
+        )
+    assert checkpointing.save() and list(trainings.values()) == [4]
+    resumed = make(planner_train_freq=40)
+    restore_training(resumed, tmp_path / "checkpoint.zip")
+    trainings.clear()
+    resumed.learn(20, PlannerTrainingCallback(folder=tmp_path), reset_num_timesteps=False)
+    assert begun(trainings) == [40, 60] and list(trainings.values()) == [2, 6]
+
+
 def test_a_checkpoint_of_other_data_is_not_gone_on_from(tmp_path, trainings):
     callback = PlannerTrainingCallback(folder=tmp_path)
     first = make().learn(40, callback)
