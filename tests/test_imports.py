@@ -62,7 +62,7 @@ def test_no_modules_import_each_other_in_a_circle():
         ("import sb3_said.delays", {"torch", "stable_baselines3"}),
         ("from sb3_said import DelayedObservationWrapper", {"torch", "stable_baselines3"}),
         ("import sb3_said.planner", {"stable_baselines3", "gymnasium"}),
-        ("import sb3_said.evaluation", {"torch", "stable_baselines3", "matplotlib"}),
+        ("import sb3_said; sb3_said.evaluation.rollout", {"torch", "stable_baselines3", "matplotlib"}),
     ],
 )
 def test_a_room_does_without_what_it_does_not_need(statement, without):

@@ -30,6 +30,9 @@ class DelayProcess(Protocol):
         """
 
 
+#: Longest delay, in control steps: ten seconds at 1 kHz. A buffer of this length is made for each episode.
+LARGEST_DELAY = 10_000
+
 #: What a user may write where a process is expected; text is read in ``text.py``.
 Delay = int | Sequence[int] | DelayProcess
 
@@ -42,7 +45,15 @@ class BaseProcess:
     max_delay: int = field(init=False, repr=False, compare=False)
 
     def _set(self, **values: Any) -> None:
-        """Set fields of the frozen instance, from ``__post_init__`` only."""
+        """Set fields of the frozen instance, from ``__post_init__`` only.
+
+        :raises ValueError: for a ``max_delay`` above ``LARGEST_DELAY``
+        """
+        if values.get("max_delay", 0) > LARGEST_DELAY:
+            raise ValueError(
+                f"Delays are at most {LARGEST_DELAY} control steps, got {values['max_delay']}; use control steps and "
+                "not other units, as in_steps(milliseconds, control_period) gives them."
+            )
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
@@ -136,9 +147,10 @@ class DistributionDelay(BaseProcess):
         :raises ValueError: for no, negative or fractional delays, or an array of another shape
         """
         drawn = np.asarray(delays)
-        if drawn.ndim != 1 or drawn.size == 0 or not np.issubdtype(drawn.dtype, np.integer) or drawn.min() < 0:
+        is_counts = drawn.ndim == 1 and drawn.size > 0 and np.issubdtype(drawn.dtype, np.integer)
+        if not (is_counts and 0 <= drawn.min() and drawn.max() <= LARGEST_DELAY):
             raise ValueError(
-                f"Measured delays are a list of whole numbers of control steps >= 0, got {drawn}; "
+                f"Measured delays are a list of whole numbers of control steps in 0..{LARGEST_DELAY}, got {drawn}; "
                 "in_steps(milliseconds, control_period) makes them."
             )
         return cls(tuple(np.bincount(drawn) / len(drawn)))
@@ -255,10 +267,12 @@ def check_probability(name: str, p: float) -> None:
         raise ValueError(f"{name} is a probability in 0..1, got {p}.")
 
 
-def checked_count(name: str, n: int, smallest: int) -> int:
-    """Return a whole number as an ``int``; refuse anything else, and less than ``smallest``, with a ``ValueError``."""
+def checked_count(name: str, n: int, smallest: int, largest: int = 10**9) -> int:
+    """Return a whole number as an ``int``; refuse anything else, and numbers out of range, with a ``ValueError``."""
     if not (_is_integer(n) and n >= smallest):
         raise ValueError(f"{name} is a whole number >= {smallest}, got {n}.")
+    if n > largest:
+        raise ValueError(f"{name} is at most {largest}, got {n}.")
     return int(n)
 
 

@@ -14,27 +14,47 @@ STATE_KEYS = ("state_history", "state_known")
 UNDELAYED = "undelayed_observation"
 #: Key in ``info`` of what the task was given, where that is not the action sent last.
 EXECUTED = "executed_action"
+#: What to do about a wrapper that changed delayed observations.
+WRAPPER_ORDER = (
+    "Wrappers that change observations go below DelayedObservationWrapper, around the task itself; "
+    "gymnasium.wrappers.FrameStackObservation and FlattenObservation do there what VecFrameStack does."
+)
 
 
 def check_task(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> tuple[spaces.Box, spaces.Box]:
     """Return the spaces of a task without delay as the Boxes that they have to be.
 
-    :raises ValueError: unless observations are a 1-D Box, and actions a 1-D Box with finite bounds that differ
+    :raises ValueError: unless observations are a 1-D Box, and actions a 1-D Box with finite bounds that differ; the
+        message says how to get there
     """
+    for what, space in (("observation", observation_space), ("action", action_space)):
+        if isinstance(space, spaces.Box) and space.shape == (0,):
+            raise ValueError(f"The {what} has no entries, got {space}; there is nothing to learn.")
     if isinstance(observation_space, spaces.Dict) and set(KEYS) <= set(observation_space.keys()):
         raise ValueError(
-            "The task is in a DelayedObservationWrapper already, and expected is a task with a 1-D Box observation; "
-            "use one wrapper with the sum of the delays, or with delay and action_delay."
+            "The task is in a DelayedObservationWrapper already. One wrapper gives every delay: "
+            "DelayedObservationWrapper(task, delay=..., action_delay=...)."
         )
     if not (isinstance(observation_space, spaces.Box) and len(observation_space.shape) == 1):
         flat = "wrap the task in gymnasium.wrappers.FlattenObservation first"
         advice = flat if observation_space.is_np_flattenable else "give the task one, of a fixed length"
         raise ValueError(f"Expected a 1-D Box observation, got {observation_space}; {advice}.")
-    if not (isinstance(action_space, spaces.Box) and len(action_space.shape) == 1 and action_space.is_bounded()):
-        box = "use gymnasium.wrappers.TransformAction(env, function, action_space) to give the task such actions"
-        advice = box if isinstance(action_space, spaces.Box) else "other actions than continuous ones are not supported"
+    if not isinstance(action_space, spaces.Box):
         raise ValueError(
-            f"Expected a 1-D Box action with finite bounds, by which it is scaled, got {action_space}; {advice}."
+            f"Expected a 1-D Box action, got {action_space}: agents here, as SAC, answer with real numbers between "
+            "bounds, so a task with discrete actions is not supported. Take its continuous variant where it has one."
+        )
+    if len(action_space.shape) != 1:
+        raise ValueError(
+            f"Expected a 1-D Box action, got {action_space}; let the agent see it flat, with "
+            "gymnasium.wrappers.TransformAction(task, lambda action: action.reshape(shape), "
+            "gymnasium.spaces.Box(low.ravel(), high.ravel()))."
+        )
+    if not action_space.is_bounded():
+        raise ValueError(
+            f"Actions are scaled by their bounds, which must be finite, got {action_space}; state the range to act in, "
+            "with gymnasium.wrappers.TransformAction(task, lambda action: action, gymnasium.spaces.Box(low, high)). "
+            "gymnasium.wrappers.ClipAction leaves the space without bounds."
         )
     if not np.all(action_space.low < action_space.high):
         raise ValueError(
@@ -112,12 +132,34 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
         if set(observation_space.keys()) not in (set(KEYS), {*KEYS, *STATE_KEYS}):
             raise ValueError(
                 f"Expected the dict observation of DelayedObservationWrapper ({', '.join(KEYS)}), "
-                f"got the keys {sorted(observation_space.keys())}; wrap the task in "
-                "gymnasium.wrappers.FlattenObservation where it has a dict of its own, and then in this."
+                f"got the keys {sorted(observation_space.keys())}; wrap the task in it, after "
+                f"gymnasium.wrappers.FlattenObservation where it has a dict of its own. {WRAPPER_ORDER}"
             )
         state_space = observation_space["observation"]
-        max_delay = observation_space["action_history"].shape[0]  # type: ignore[index]  # a Box has a shape
-    return check_task(state_space, action_space)[0], max_delay
+        max_delay = (observation_space["action_history"].shape or (0,))[0]
+    state_box, action_box = check_task(state_space, action_space)
+    if isinstance(observation_space, spaces.Dict):
+        _check_parts(observation_space, state_box, action_box, max_delay)
+    return state_box, max_delay
+
+
+def _check_parts(space: spaces.Dict, state_box: spaces.Box, action_box: spaces.Box, max_delay: int) -> None:
+    """:raises ValueError: for a part of a delayed space that ``DelayedObservationWrapper`` does not give"""
+    shapes = {"observation": state_box.shape, "action_history": (max_delay, *action_box.shape), "delay": (1,)}
+    if has_state_history(space):
+        shapes |= {"state_history": (max_delay, *state_box.shape), "state_known": (max_delay,)}
+    for key, shape in shapes.items():  # before a space of max_delay is built, which may be 1e9
+        if space[key].shape != shape:
+            raise ValueError(
+                f"{key} was changed to {space[key]}, where DelayedObservationWrapper gives the shape {shape}. "
+                f"{WRAPPER_ORDER}"
+            )
+    for key, box in delayed_space(state_box, action_box, max_delay, has_state_history(space)).items():
+        is_state = key in ("observation", "state_history")  # whose bounds VecNormalize may set
+        if not is_state and space[key] != box:
+            raise ValueError(
+                f"{key} was changed to {space[key]}, where DelayedObservationWrapper gives {box}. {WRAPPER_ORDER}"
+            )
 
 
 def has_state_history(observation_space: spaces.Space[Any]) -> bool:
@@ -138,6 +180,21 @@ def ages_of(env: Any) -> list[int]:
     else:
         ranges = [env.get_wrapper_attr("age_range") if env.has_wrapper_attr("age_range") else (0, 0)]
     return sorted({age for low, high in ranges for age in range(low, high + 1)})
+
+
+def check_one_max_delay(env: Any) -> None:
+    """Refuse environments whose action histories differ in length, so that no batch could hold them.
+
+    :param env: as of :func:`ages_of`
+    :raises ValueError: where the ``max_delay`` of an SB3 ``VecEnv``'s environments differ
+    """
+    if hasattr(env, "get_attr") and isinstance(env.observation_space, spaces.Dict) and env.has_attr("max_delay"):
+        largest = env.get_attr("max_delay")
+        if len(set(largest)) > 1:
+            raise ValueError(
+                f"The environments' action histories must be of one length, but their max_delay are {largest}; give "
+                f"each of them DelayedObservationWrapper(..., max_delay={max(largest)})."
+            )
 
 
 def written_ages(ages: list[int]) -> str:

@@ -59,15 +59,33 @@ def parse_process(text: str) -> int | tuple[int, int] | DelayProcess:
     """
     try:
         return _evaluate(ast.parse(text.strip(), mode="eval").body)
-    except (SyntaxError, TypeError) as error:
+    except (SyntaxError, TypeError, RecursionError, MemoryError) as error:  # the last two are of deep nesting
         raise ValueError(
-            f"{text!r} is no delay: {error}. Write it as in docs/delays.md, such as {_EXAMPLE}."
+            f"{text!r:.200} is no delay: {error!s:.200}. Write it as in docs/delays.md, such as {_EXAMPLE}."
         ) from error
+
+
+def as_text(delay: Delay | str) -> Delay | str:
+    """Return a delay as :func:`make_process` reads it back from JSON; a user's own process stays the object it is.
+
+    :param delay: as :func:`make_process` takes it
+    """
+    if isinstance(delay, (int, str)):
+        return delay
+    process = make_process(delay)
+    try:
+        return repr(process) if parse_process(repr(process)) == process else delay
+    except ValueError:
+        return delay
 
 
 def _evaluate(node: ast.expr) -> Any:
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in CLASSES:
-        keywords = {str(k.arg): _evaluate(k.value) for k in node.keywords}
+        keywords: dict[str, Any] = {}
+        for keyword in node.keywords:
+            if (name := str(keyword.arg)) in keywords:  # which Python's compiler refuses, and its parser does not
+                raise SyntaxError(f"{name} is given twice")
+            keywords[name] = _evaluate(keyword.value)
         return CLASSES[node.func.id](*(_evaluate(arg) for arg in node.args), **keywords)
     if isinstance(node, ast.Name) and node.id in CONSTANTS:
         return CONSTANTS[node.id]
@@ -78,5 +96,6 @@ def _evaluate(node: ast.expr) -> Any:
         if isinstance(value, (int, float)) and not isinstance(value, bool):
             return value
     raise ValueError(
-        f"{ast.unparse(node)!r} is no delay: expected numbers, {', '.join([*CONSTANTS, *CLASSES])}, such as {_EXAMPLE}."
+        f"{ast.unparse(node)!r:.200} is no delay: expected numbers, {', '.join([*CONSTANTS, *CLASSES])}, "
+        f"such as {_EXAMPLE}."
     )

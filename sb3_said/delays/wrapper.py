@@ -8,10 +8,10 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_said.delays.combined import TotalDelay
-from sb3_said.delays.processes import Delay, as_process, checked_count
+from sb3_said.delays.processes import LARGEST_DELAY, Delay, as_process, checked_count
 from sb3_said.delays.receivers import RECEIVERS, Actuator
 from sb3_said.delays.space import EXECUTED, UNDELAYED, check_task, delayed_space, scale_action
-from sb3_said.delays.text import age_range, make_process
+from sb3_said.delays.text import age_range, as_text, make_process
 
 #: Keeps the delays' random numbers apart from those that the task draws from the same seed.
 DELAY_STREAM = 1
@@ -87,8 +87,8 @@ class DelayedObservationWrapper(
     ):
         gym.utils.RecordConstructorArgs.__init__(
             self,
-            delay=delay,
-            action_delay=action_delay,
+            delay=as_text(delay),  # an EnvSpec is written as JSON
+            action_delay=as_text(action_delay),
             max_delay=max_delay,
             receiver=receiver,
             state_history=state_history,
@@ -98,7 +98,8 @@ class DelayedObservationWrapper(
         self.process = make_process(delay)
         if action_delay != 0:
             self.process = TotalDelay(self.process, make_process(action_delay))
-        self.max_delay = checked_count("max_delay", self.process.max_delay if max_delay is None else max_delay, 0)
+        longest = self.process.max_delay if max_delay is None else max_delay
+        self.max_delay = checked_count("max_delay", longest, 0, LARGEST_DELAY)
         if self.max_delay < self.process.max_delay:
             raise ValueError(f"max_delay={max_delay} is smaller than the largest delay {self.process.max_delay}.")
         if receiver not in RECEIVERS:
@@ -136,10 +137,13 @@ class DelayedObservationWrapper(
         """Reset the task; s_0 arrives at once.
 
         :param seed: seeds the task and the delay process
-        :raises ValueError: when the process draws a delay outside 0..max_delay
+        :raises ValueError: when the process draws a delay outside 0..max_delay, or the task's answer is malformed
         """
         state: Any
-        state, info = self.env.reset(seed=seed, options=options)
+        info: Any
+        answer: Any = self.env.reset(seed=seed, options=options)
+        state, info = answer if isinstance(answer, tuple) and len(answer) == 2 else (answer, None)
+        self._check_answer(state, info)
         if seed is not None:
             self._rng = np.random.default_rng([seed, DELAY_STREAM])
         if self.actuator is not None:
@@ -152,15 +156,26 @@ class DelayedObservationWrapper(
         """Send the action; observe what has arrived.
 
         :param action: (act_dim,), in the units of the action space
-        :raises ValueError: when the process draws a delay outside 0..max_delay
+        :raises ValueError: when the process draws a delay outside 0..max_delay, or the task's answer is malformed
         """
         state: Any
         executed = action if self.actuator is None else self.actuator.execute(action)
-        state, reward, terminated, truncated, info = self.env.step(executed)
+        state, reward, terminated, truncated, info = self.env.step(np.array(executed))  # which a task may change
+        self._check_answer(state, info)
         _append(self._actions, scale_action(action, self._task_action_space))
         age = self.receiver.step()
         lag, shown = (0, None) if self.actuator is None else (self.actuator.lag(age), executed)
         return self._observe(state, age, lag), reward, terminated, truncated, self._with_own(info, shown)
+
+    def _check_answer(self, state: Any, info: Any) -> None:
+        """Refuse what NumPy would broadcast or cast in silence, with a ``ValueError``."""
+        given, shape = np.asarray(state), self._states.shape[1:]
+        if given.shape != shape or given.dtype.kind not in "biuf" or not isinstance(info, dict):
+            raise ValueError(
+                f"The task answered with an observation of shape {given.shape} that holds {given.dtype}, and with an "
+                f"info of type {type(info).__name__}; expected shape {shape}, real numbers and a dict. "
+                "gymnasium.utils.env_checker.check_env(task) finds such mistakes."
+            )
 
     def _observe(self, state: np.ndarray, age: int, lag: int = 0) -> dict[str, np.ndarray]:
         """Hand out the state of an age; ``lag`` actions sent before that state do not show in it yet."""

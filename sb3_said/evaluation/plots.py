@@ -77,15 +77,16 @@ def plot_learning_curve(run: str | Path, ax: Axes | None = None, window: int = 2
 
     Its colours are none of a planner's and an expert's in :func:`plot_returns`, so that both fit into one figure.
 
-    :param run: folder with ``*.monitor.csv`` (SB3's Monitor), ``evaluations.npz`` (SB3's EvalCallback), or both
+    :param run: folder with ``*.monitor.csv`` (SB3's Monitor), ``evaluations.npz`` (SB3's EvalCallback), or both; of a
+        run of SAID the latter are the trained agent's, and those of the expert lie in ``expert/``
     :param ax: to draw on; a new figure by default
     :param window: training episodes in the running mean
     :raises ValueError: when the folder holds neither file
     """
     run = Path(run)
     steps, returns = _read_monitors(sorted(run.glob("*monitor.csv")))
-    evaluations = run / "evaluations.npz"
-    if not len(steps) and not evaluations.is_file():
+    files = [run / "expert" / "evaluations.npz", run / "evaluations.npz"]
+    if not len(steps) and not any(file.is_file() for file in files):
         raise ValueError(f"{run} holds neither episodes in *.monitor.csv nor evaluations.npz; give a training run.")
     ax = panels()[0] if ax is None else ax
     if len(steps):
@@ -93,12 +94,15 @@ def plot_learning_curve(run: str | Path, ax: Axes | None = None, window: int = 2
         mean = np.convolve(returns, np.full(window, 1 / window), mode="valid")
         ax.plot(steps, returns, ".", color=COLORS[2], alpha=0.2, markersize=3, markeredgewidth=0)
         ax.plot(steps[window - 1 :], mean, color=COLORS[2], label=f"training, mean of {window} episodes")
-    if evaluations.is_file():
-        with np.load(evaluations) as file:
-            eval_steps, results = file["timesteps"], file["results"]
-        value, low, high = _bounds([confidence_interval(row) for row in results])
-        ax.plot(eval_steps, value, color=COLORS[3], marker="o", markersize=3, label="evaluation, 95 % interval")
-        ax.fill_between(eval_steps, low, high, color=COLORS[3], alpha=0.2, linewidth=0)
+    own = "evaluation of the trained agent" if files[0].is_file() else "evaluation"
+    for path, name, color in zip(files, ("evaluation of the expert", own), (COLORS[3], COLORS[4]), strict=True):
+        if path.is_file():
+            with np.load(path) as file:
+                known = ~np.isnan(file["results"]).any(axis=1)  # at step 0 there is no planner
+                eval_steps, results = file["timesteps"][known], file["results"][known]
+            value, low, high = _bounds([confidence_interval(row) for row in results])
+            ax.plot(eval_steps, value, color=color, marker="o", markersize=3, label=f"{name}, 95 % interval")
+            ax.fill_between(eval_steps, low, high, color=color, alpha=0.2, linewidth=0)
     ax.set_xlabel("environment steps")
     ax.set_ylabel("return of an episode (undiscounted)")
     ax.legend(frameon=False)

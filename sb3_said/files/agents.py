@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
+import math
 import os
 import pathlib
 import warnings
-from collections.abc import Collection
 from typing import Any, ClassVar, TypeVar
 
 import torch as th
@@ -17,7 +18,15 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import ConstantSchedule, get_device, get_system_info
 
 from sb3_said.files.archive import PathOrFile, SavedFileError, load_metadata, load_tree, readable, save_tree
-from sb3_said.files.arguments import as_data, from_data, space_as_data, space_from_data
+from sb3_said.files.arguments import as_data, check_noise, from_data, space_as_data, space_from_data
+from sb3_said.files.checks import (
+    check_argument,
+    check_names,
+    check_numbers,
+    check_optimizer_state,
+    check_tensors,
+    no_larger_than,
+)
 
 SelfSafeSave = TypeVar("SelfSafeSave", bound="SafeSaveMixin")
 SelfSafePolicy = TypeVar("SelfSafePolicy", bound="SafePolicyMixin")
@@ -43,12 +52,16 @@ class SafeSaveMixin(OffPolicyAlgorithm):
         :param path: where to write; without a suffix, ``.zip`` is added. Or a binary file object.
         :raises ValueError: for spaces other than Box and Dict of Box
         """
-        arguments, missing = {}, {}
+        arguments: dict[str, Any] = {}
+        missing: dict[str, str] = {}
         for name in sorted(self._argument_names()):
             value = getattr(self, {"stats_window_size": "_stats_window_size"}.get(name, name))
             if not any(value is own for own in (self.policy_aliases["MlpPolicy"], *self.own_classes)):
                 try:
-                    arguments[name] = as_data(value, name)
+                    data = as_data(value, name)
+                    check_numbers(name, data)
+                    self._check_argument(name, from_data(data), self.policy_class)
+                    arguments[name] = data
                 except ValueError as error:
                     missing[name] = str(error)
         if missing:
@@ -99,9 +112,18 @@ class SafeSaveMixin(OffPolicyAlgorithm):
         given = {name: value for name, value in (custom_objects or {}).items() if name in names}
         saved = load_tree(path, cls.__name__)
         with readable(path):
-            _check_names("arguments", saved["arguments"], names, exact=False)
-            arguments = {n: from_data(node) for n, node in saved["arguments"].items() if n not in given} | given
+            check_names("arguments", saved["arguments"], names, exact=False)
+            nodes = {name: node for name, node in saved["arguments"].items() if name not in given}
+            check_numbers("arguments", nodes)
+            arguments = {name: from_data(node) for name, node in nodes.items()}
+            policy_class = arguments.get("policy_class", cls.policy_aliases["MlpPolicy"])
+            for name, value in arguments.items():
+                cls._check_argument(name, value, policy_class)
+            arguments |= given
             observation_space, action_space = map(space_from_data, saved["spaces"])
+            check_noise(arguments.get("action_noise"), action_space)
+            if type(saved["n_envs"]) is not int or saved["n_envs"] < 1:
+                raise SavedFileError(f"its n_envs is {saved['n_envs']!r:.50}, expected at least 1")
             if absent := [name for name in saved["missing"] if name not in given | kwargs]:
                 warnings.warn(
                     f"The file lacks {', '.join(absent)}, so {cls.__name__} takes its defaults; custom_objects supplies"
@@ -118,11 +140,16 @@ class SafeSaveMixin(OffPolicyAlgorithm):
         with readable(path, explained=(ValueError, AssertionError)):  # SB3 asserts what it needs of an environment
             arguments |= {"device": device, "_init_setup_model": False}
             model = cls(policy, env, **arguments)  # type: ignore[arg-type]  # SB3 takes no env, too
-            _restore_counters(model, saved["counters"])  # _setup_model may ask whether the agent is new
+            _check_counters(model, saved["counters"])
+            for name in model.counters:  # _setup_model may ask whether the agent is new
+                setattr(model, name, saved["counters"][name])
             model.observation_space, model.action_space = observation_space, action_space
             if model.env is None:
                 model.n_envs = saved["n_envs"]
-            model._setup_model()
+            # Where the caller asks for other networks, the file says nothing about their size.
+            own_networks = not any(isinstance(value, (dict, type)) for value in (given | kwargs).values())
+            with no_larger_than(saved["parameters"]["policy"]) if own_networks else contextlib.nullcontext():
+                model._setup_model()
             restore_agent(model, saved)
             if model.env is not None:
                 model.set_env(model.env)
@@ -147,7 +174,15 @@ class SafeSaveMixin(OffPolicyAlgorithm):
         path = _existing(load_path_or_dict)
         saved = load_tree(path, kind=None)
         with readable(path):
-            _restore_parameters(self, saved["parameters"], exact_match)
+            _take_parameters(self, _fitting_parameters(self, saved["parameters"], exact_match), exact_match)
+
+    @classmethod
+    def _check_argument(cls, name: str, value: Any, policy_class: type) -> None:
+        """:raises ValueError: for an argument of another type than its constructor declares, or out of range"""
+        check_argument(name, value, cls)
+        if name == "policy_kwargs" and value is not None:
+            for key, item in value.items():
+                check_argument(key, item, policy_class)
 
     @classmethod
     def _argument_names(cls) -> set[str]:
@@ -189,9 +224,14 @@ class SafePolicyMixin(BasePolicy):
         """
         saved = load_tree(path, cls.__name__)
         with readable(path):
+            check_numbers("arguments", saved["arguments"])
             arguments = from_data(saved["arguments"])
-            policy = cls(*map(space_from_data, saved["spaces"]), ConstantSchedule(0.0), **arguments)
-            _check_tensors("state_dict", saved["state_dict"], policy.state_dict())
+            for name, value in arguments.items():
+                check_argument(name, value, cls)
+            own_spaces = map(space_from_data, saved["spaces"])
+            with no_larger_than(saved["state_dict"]):
+                policy = cls(*own_spaces, ConstantSchedule(0.0), **arguments)
+            check_tensors("state_dict", saved["state_dict"], policy.state_dict())
             policy.load_state_dict(saved["state_dict"])
         policy.to(get_device(device))
         if arguments.get("use_sde"):  # its noise was drawn before the parameters were there
@@ -210,73 +250,55 @@ def agent_state(model: SafeSaveMixin) -> dict[str, Any]:
 
 
 def restore_agent(model: SafeSaveMixin, saved: dict[str, Any]) -> None:
-    """Take over what :func:`agent_state` returned, each part once it is known to fit the model's own.
+    """Take over what :func:`agent_state` returned, once it is known to fit the model's own.
 
     :raises SavedFileError: for parts of other names, shapes or types, or that are not finite
     """
-    _restore_counters(model, saved["counters"])
-    _restore_parameters(model, saved["parameters"])
+    _check_counters(model, saved["counters"])
+    parameters = _fitting_parameters(model, saved["parameters"])
     own = {name: getattr(model, name).data for name in model._get_torch_save_params()[1]}
-    _check_tensors("variables", saved["variables"], own)
+    check_tensors("variables", saved["variables"], own)
+    for name in model.counters:
+        setattr(model, name, saved["counters"][name])
+    _take_parameters(model, parameters)
     for name, value in own.items():
         value.copy_(saved["variables"][name])
 
 
-def _restore_counters(model: SafeSaveMixin, saved: dict[str, Any]) -> None:
-    _check_names("counters", saved, model.counters)
+def _check_counters(model: SafeSaveMixin, saved: dict[str, Any]) -> None:
+    check_names("counters", saved, model.counters)
     for name in model.counters:
         value, own = saved[name], getattr(model, name)
-        if isinstance(own, (int, float)):
-            fits = type(value) is type(own)
+        if isinstance(own, int):
+            fits = type(value) is int and 0 <= value < 2**63
+        elif isinstance(own, float):
+            fits = type(value) is float and math.isfinite(value)
         else:  # ages, where it has learned
-            fits = value is None or (type(value) is list and all(type(item) is int for item in value))
+            fits = value is None or (type(value) is list and all(type(x) is int and 0 <= x < 2**31 for x in value))
         if not fits:
             raise SavedFileError(f"its part 'counters' does not fit: {name} is {value!r:.50}")
-        setattr(model, name, value)
 
 
-def _restore_parameters(model: SafeSaveMixin, saved: dict[str, Any], exact: bool = True) -> None:
+def _fitting_parameters(model: SafeSaveMixin, saved: dict[str, Any], exact: bool = True) -> dict[str, Any]:
+    """Return what a model takes over of saved networks and optimizers, once it is known to fit."""
     saved, own = model._adapt_parameters(saved), model.get_parameters()
-    _check_names("parameters", saved, own, exact)
+    check_names("parameters", saved, own, exact)
     for name, state in saved.items():
         target = recursive_getattr(model, name)
         if isinstance(target, th.optim.Optimizer):
-            owners = dict(enumerate(p for group in target.param_groups for p in group["params"]))
-            _check_names(name, state, owners, exact=False)
-            for index, values in state.items():
-                _check_optimizer_state(f"{name}[{index}]", values, owners[index].shape)
-            target.load_state_dict({**own[name], "state": state})
+            check_optimizer_state(name, state, target)
         else:
-            _check_tensors(name, state, own[name], exact)
+            check_tensors(name, state, own[name], exact)
+    return saved
+
+
+def _take_parameters(model: SafeSaveMixin, saved: dict[str, Any], exact: bool = True) -> None:
+    for name, state in saved.items():
+        target = recursive_getattr(model, name)
+        if isinstance(target, th.optim.Optimizer):
+            target.load_state_dict({**target.state_dict(), "state": state})
+        else:
             target.load_state_dict(state, strict=exact)
-
-
-def _check_optimizer_state(where: str, state: dict[str, Any], shape: th.Size) -> None:
-    for name, value in state.items():  # as large as its parameter or, as the step, a number for all of it
-        fits = isinstance(value, (int, float, type(None)))
-        if isinstance(value, th.Tensor):
-            fits = th.broadcast_shapes(value.shape, shape) == shape and bool(th.isfinite(value).all())
-        if not fits:
-            raise SavedFileError(f"its part {where!r} does not fit: {name} is not of {tuple(shape)}, or not finite")
-
-
-def _check_tensors(where: str, saved: dict[str, Any], own: dict[str, Any], exact: bool = True) -> None:
-    _check_names(where, saved, own, exact)
-    for name, value in saved.items():
-        shape, dtype = own[name].shape, own[name].dtype
-        if not isinstance(value, th.Tensor) or (value.shape, value.dtype) != (shape, dtype):
-            given = (value.dtype, tuple(value.shape)) if isinstance(value, th.Tensor) else value
-            raise SavedFileError(
-                f"its part {where!r} does not fit: {name} is {given!s:.60}, expected {dtype, tuple(shape)}"
-            )
-        if not th.isfinite(value).all():
-            raise SavedFileError(f"its part {where!r} does not fit: {name} has NaN or infinite entries")
-
-
-def _check_names(where: str, saved: Collection[Any], own: Collection[Any], exact: bool = True) -> None:
-    lacking, unknown = [x for x in own if x not in saved], [x for x in saved if x not in own]
-    if unknown or (exact and lacking):
-        raise SavedFileError(f"its part {where!r} does not fit: it lacks {lacking[:5]} and has unknown {unknown[:5]}")
 
 
 def _existing(path: PathOrFile) -> PathOrFile:

@@ -7,6 +7,7 @@ plain values, arrays and tensors and nothing else, so a file from a stranger run
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import math
 import os
@@ -21,8 +22,10 @@ import torch as th
 
 from sb3_said.files.atomic import PathOrFile, replacing
 
-FORMAT = 2
+FORMAT = 3
+_UNSEALED_FORMAT = 2  # files without a seal, which are read as before
 
+_MAX_DOCUMENT = 2**24  # bytes of tree.json, whose objects take twenty times as much memory
 _MAX_HEADER = 1024  # bytes that describe an array of numbers; a longer text could exhaust NumPy's parser
 
 
@@ -33,7 +36,8 @@ class SavedFileError(ValueError):
 def save_tree(path: PathOrFile, tree: Any, metadata: dict[str, Any] | None = None, kind: str = "tree") -> None:
     """Write nested data that :func:`load_tree` gives back unchanged.
 
-    Arrays are written piece by piece from where they lie. A path is replaced only once the new file is whole.
+    Arrays are written piece by piece from where they lie. A path is written as
+    :func:`~sb3_said.files.atomic.replacing` does it: whole or not at all, also by several processes at a time.
 
     :param path: where to write; missing folders are made. Or a binary file object, open for writing.
     :param tree: dicts (str or int keys), lists and tuples of None, bool, int, float, str, tensors, and NumPy arrays and
@@ -54,11 +58,23 @@ def save_tree(path: PathOrFile, tree: Any, metadata: dict[str, Any] | None = Non
     versions = {name: sys.modules[name].__version__ for name in libraries if name in sys.modules}
     document = {"format": FORMAT, "kind": kind, "versions": versions, "metadata": metadata or {}, "tree": root}
     text = json.dumps(document)
+    if len(text) > _MAX_DOCUMENT:
+        raise ValueError(f"The data is too large without its arrays, {len(text)} characters; put numbers into arrays.")
     with replacing(path) as file, zipfile.ZipFile(file, "w") as archive:
         archive.writestr(zipfile.ZipInfo("tree.json"), text)  # ZipInfo without a date: equal data, equal bytes
         for index, array in enumerate(arrays):
             with archive.open(zipfile.ZipInfo(f"{index}.npy"), "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, array, version=(1, 0), allow_pickle=False)
+        archive.comment = seal(archive)
+
+
+def seal(archive: zipfile.ZipFile) -> bytes:
+    """Return the digest of an archive's names and checksums, which :func:`save_tree` leaves as its comment.
+
+    It tells a file that was changed after it was saved. It is no signature: whoever writes a file can seal it.
+    """
+    members = "".join(f"{info.filename} {info.CRC}\n" for info in archive.infolist())
+    return hashlib.sha256(members.encode()).hexdigest().encode()
 
 
 def load_tree(path: PathOrFile, kind: str | None = "tree") -> Any:
@@ -76,6 +92,23 @@ def load_tree(path: PathOrFile, kind: str | None = "tree") -> Any:
         if next(arrays, None) is not None:
             raise SavedFileError("it holds more arrays than its data names")
         return tree
+
+
+def to_json(tree: Any) -> Any:
+    """Return a tree without arrays as a JSON document that :func:`from_json` gives back unchanged.
+
+    :raises ValueError: for an array, and for what :func:`save_tree` does not take
+    """
+    arrays: list[np.ndarray] = []
+    node = _encode(tree, "tree", arrays)
+    if arrays:
+        raise ValueError(f"JSON holds no arrays, but there is one of the shape {arrays[0].shape}.")
+    return node
+
+
+def from_json(node: Any) -> Any:
+    """Read what :func:`to_json` returned, running no code from it."""
+    return _decode(node, iter(()))
 
 
 def load_metadata(path: PathOrFile) -> dict[str, Any]:
@@ -99,8 +132,12 @@ def readable(source: PathOrFile, explained: tuple[type[Exception], ...] = (Saved
     except explained as error:
         raise SavedFileError(f"Cannot load {name}: {str(error).rstrip('.')}.") from error
     except Exception as error:
-        if isinstance(error, (MemoryError, Warning)) or (isinstance(error, OSError) and error.filename is not None):
+        if isinstance(error, Warning) or (isinstance(error, OSError) and error.filename is not None):
             raise  # an OSError with a name is from opening the file, and says so
+        if isinstance(error, MemoryError):
+            raise SavedFileError(
+                f"Cannot load {name}: what it says it holds needs more memory than there is."
+            ) from error
         raise SavedFileError(
             f"Cannot load {name}: the file is damaged, incomplete, or was not written by sb3_said"
             f" ({type(error).__name__}: {error}). Get or save the file again."
@@ -145,7 +182,10 @@ def _decode(node: Any, arrays: Iterator[np.ndarray]) -> Any:
     if tag == "!tuple":
         return tuple(_decode(item, arrays) for item in content)
     if tag == "!dict":
-        return {key: _decode(item, arrays) for key, item in content}
+        pairs = [(key, _decode(item, arrays)) for key, item in content]
+        if any(type(key) not in (str, int) for key, _ in pairs):
+            raise SavedFileError("it has keys other than str and int")
+        return dict(pairs)
     if tag != "!array" or content not in ("tensor", "array", "scalar"):
         raise SavedFileError(f"unknown entry {tag!r}")
     array = next(arrays)
@@ -172,12 +212,16 @@ def _opened(source: PathOrFile) -> Iterator[tuple[zipfile.ZipFile, dict[str, Any
             raise SavedFileError("its members are compressed, which sb3_said never does and a zip bomb needs")
         if sum(info.file_size for info in archive.infolist()) > n_bytes:
             raise SavedFileError("its members claim to be larger than the file")
+        if archive.getinfo("tree.json").file_size > _MAX_DOCUMENT:
+            raise SavedFileError(f"its tree.json is larger than {_MAX_DOCUMENT} bytes, which sb3_said never writes")
         document = json.loads(archive.read("tree.json"))
         if document["format"] > FORMAT:
             raise SavedFileError(
                 f"its format number is {document['format']}, this sb3_said reads up to {FORMAT}: upgrade sb3_said"
-                f" (the file was written with {document.get('versions')})"
+                f" (the file was written with {document.get('versions')!s:.200})"
             )
+        if document["format"] != _UNSEALED_FORMAT and archive.comment != seal(archive):
+            raise SavedFileError("it was changed after sb3_said wrote it")
         yield archive, document
 
 

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from numbers import Real
 from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
+from stable_baselines3.common.noise import (
+    ActionNoise,
+    NormalActionNoise,
+    OrnsteinUhlenbeckActionNoise,
+    VectorizedActionNoise,
+)
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
@@ -32,6 +38,8 @@ _PARTS: dict[type, Callable[[Any], tuple[Any, ...]]] = {
     OrnsteinUhlenbeckActionNoise: lambda n: (n._mu, n._sigma, n._theta, n._dt, n.initial_noise, np.dtype(n._dtype).str),
 }
 _BUILDERS = {cls.__name__: cls for cls in _PARTS}
+_SCHEDULES = (ConstantSchedule, FloatSchedule, LinearSchedule)
+_NOISE_TYPES = ("<f4", "<f8")
 
 
 def as_data(value: Any, where: str) -> Any:
@@ -63,7 +71,7 @@ def as_data(value: Any, where: str) -> Any:
 def from_data(node: Any) -> Any:
     """Return the argument that :func:`as_data` was given.
 
-    :raises SavedFileError: for a name that is not in the tables of this module
+    :raises SavedFileError: for a name that is not in the tables of this module, or parts that do not go with it
     """
     if isinstance(node, (list, tuple)):
         return type(node)(from_data(item) for item in node)
@@ -73,10 +81,30 @@ def from_data(node: Any) -> Any:
         return {key: from_data(item) for key, item in node.items()}
     name, *parts = node["@"]
     if name in _BUILDERS:
-        return _BUILDERS[name](*map(from_data, parts))
+        cls, parts = _BUILDERS[name], [from_data(part) for part in parts]
+        is_noise = issubclass(cls, ActionNoise)
+        allowed = (Real, np.ndarray, type(None)) if is_noise else (Real, *_SCHEDULES)
+        if any(not isinstance(part, allowed) and not (is_noise and part in _NOISE_TYPES) for part in parts):
+            raise SavedFileError(f"its {name} is made of {parts!s:.100}")
+        return cls(*parts)
     if name not in _CLASSES or parts:
         raise SavedFileError(f"it names {name!r}, which no file of sb3_said does; loading builds nothing of that name")
     return _CLASSES[name]
+
+
+def check_noise(noise: Any, action_space: spaces.Space[Any]) -> None:
+    """Hold action noise from a file against the actions.
+
+    :raises SavedFileError: for another shape, or a negative scale
+    """
+    if isinstance(noise, (NormalActionNoise, OrnsteinUhlenbeckActionNoise)):
+        shapes = {
+            np.shape(part)
+            for part in (noise._mu, noise._sigma, getattr(noise, "initial_noise", None))
+            if part is not None
+        }
+        if not shapes <= {(), action_space.shape} or np.any(np.asarray(noise._sigma) < 0):
+            raise SavedFileError(f"its action_noise {noise!s:.100} does not go with actions of {action_space.shape}")
 
 
 def space_as_data(space: spaces.Space[Any]) -> Any:
@@ -92,8 +120,14 @@ def space_as_data(space: spaces.Space[Any]) -> Any:
 
 
 def space_from_data(node: Any) -> spaces.Space[Any]:
-    """Return the space that :func:`space_as_data` was given."""
+    """Return the space that :func:`space_as_data` was given.
+
+    :raises SavedFileError: for bounds that no space has
+    """
     if isinstance(node, dict):  # pairs: a dict would be sorted, and the order of the keys is that of a network's inputs
         return spaces.Dict([(key, space_from_data(part)) for key, part in node.items()])
     low, high = node
+    fits = all(isinstance(x, np.ndarray) for x in node) and (low.shape, low.dtype) == (high.shape, high.dtype)
+    if not fits or low.dtype.kind not in "iuf" or not np.all(low <= high):
+        raise SavedFileError("a space has bounds that do not belong together")
     return spaces.Box(low, high, dtype=low.dtype)

@@ -11,21 +11,25 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
-PathOrFile = str | os.PathLike[str] | IO[bytes]
+try:
+    import fcntl
+except ImportError:  # Windows, which removes no open file
+    fcntl = None  # type: ignore[assignment]
 
-ABANDONED_AFTER = 600.0  # seconds since a write's last byte; no running write is that slow
+PathOrFile = str | os.PathLike[str] | IO[bytes]
 
 
 @contextlib.contextmanager
 def replacing(target: PathOrFile) -> Iterator[IO[bytes]]:
     """Write beside the target and swap at the end: a crash leaves the old file, never half a file.
 
-    A write removes what killed ones left beside its target, once it is ``ABANDONED_AFTER`` old. Several processes may
-    write one target at a time: the last to finish wins.
+    Several processes may write one target at a time: each writes a file of its own, and the last to finish wins. A
+    write removes what killed ones left beside its target, and nothing that is still being written.
 
     :param target: where to write; missing folders are made. A device or a pipe is written to and stays, and a binary
         file object is given back as it is.
     :raises ValueError: if the target is a folder
+    :raises OSError: naming the target, such as for a full disk
     """
     if not isinstance(target, (str, os.PathLike)):
         yield target
@@ -37,22 +41,51 @@ def replacing(target: PathOrFile) -> Iterator[IO[bytes]]:
             yield file
         return
     path = Path(os.path.realpath(target))  # a symbolic link stays, and what it points to is replaced
-    path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
     try:
-        with open(scratch, "xb") as file:
-            now = scratch.stat().st_mtime  # by the file system's clock, as the others' times
-            for left in path.parent.glob(glob.escape(f".{path.name}.") + "[0-9a-f]" * 8 + ".tmp"):
-                with contextlib.suppress(OSError):  # one that cannot be removed does no harm
-                    if now - left.stat().st_mtime > ABANDONED_AFTER:
-                        left.unlink()
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(scratch, path)
-    except BaseException:
-        scratch.unlink(missing_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        remove_abandoned(path.parent, path.name)
+        scratch = _scratch_of(path)
+        try:
+            with scratch:
+                yield scratch
+                scratch.flush()
+                os.fsync(scratch.fileno())
+                if fcntl is not None:  # while the lock is held: no other write takes it for abandoned
+                    os.replace(scratch.name, path)
+            if fcntl is None:  # Windows moves no open file
+                os.replace(scratch.name, path)
+        except BaseException:
+            Path(scratch.name).unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        error.filename = error.filename or str(path)  # that of a full disk has none
         raise
+
+
+def remove_abandoned(folder: Path, name: str | None = None) -> None:
+    """Remove what killed writes left in a folder.
+
+    :param name: of the target that they were to replace; all by default
+    """
+    for left in folder.glob(f".{'*' if name is None else glob.escape(name)}." + "[0-9a-f]" * 8 + ".tmp"):
+        # One that cannot be removed does no harm; one that is being written is locked, and on Windows stays.
+        with contextlib.suppress(OSError), contextlib.ExitStack() as stack:
+            if fcntl is not None:
+                fcntl.flock(stack.enter_context(open(left, "r+b")), fcntl.LOCK_EX | fcntl.LOCK_NB)
+            left.unlink()
+
+
+def _scratch_of(path: Path) -> IO[bytes]:
+    """Open a new file beside a path, locked for as long as this process writes it."""
+    while True:
+        file = open(path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp"), "xb")
+        if fcntl is None:
+            return file
+        with contextlib.suppress(OSError):  # a file system without locks
+            fcntl.flock(file, fcntl.LOCK_EX)
+        if os.fstat(file.fileno()).st_nlink > 0:  # else another write took it for abandoned before it was locked
+            return file
+        file.close()
 
 
 def write_text(path: Path, text: str) -> None:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import random
+import time
+import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,52 +14,117 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.running_mean_std import RunningMeanStd
-from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_said.files.agents import SafeSaveMixin, agent_state, restore_agent
 from sb3_said.files.archive import SavedFileError, load_tree, readable, save_tree
+from sb3_said.files.normalization import check_statistics, get_statistics, set_statistics
 
 CHECKPOINT_NAME = "checkpoint.zip"
 _EVALUATION = ("n_calls", "best_mean_reward", "evaluations_timesteps", "evaluations_results", "evaluations_length")
 
 
+SECONDS = 600.0  # of training between two checkpoints, at least
+BYTES_A_SECOND = 500_000  # that checkpoints write at most, over the whole training
+
+
 class TrainingCheckpointCallback(BaseCallback):
-    """Write everything that a run needs to go on, every ``save_freq`` environment steps and when learning ends.
+    """Write everything that a run needs to go on, from time to time and when learning ends.
 
     Model, optimizers, replay buffer, counters, normalisation statistics, evaluations so far and random states go into
     one file, which replaces the previous one only once it is whole.
 
     :param folder: of the run; the file is ``checkpoint.zip`` in it
-    :param save_freq: environment steps between two checkpoints
+    :param save_freq: environment steps between two checkpoints. By default time decides: ten minutes, and longer where
+        the replay is large, so that checkpoints write at most half a megabyte a second (2.4 GB every 80 minutes)
+    :param should_stop: asked before every rollout, where nothing is half done; learning then ends with a
+        ``KeyboardInterrupt``
     """
 
-    def __init__(self, folder: str | Path, save_freq: int):
+    def __init__(self, folder: str | Path, save_freq: int | None = None, should_stop: Callable[[], bool] | None = None):
         super().__init__()
         self.path = Path(folder) / CHECKPOINT_NAME
         self.save_freq = save_freq
-        self._saved_at = 0
+        self.should_stop = should_stop or (lambda: False)
+        self._tried_at = self._saved_at = -1  # num_timesteps
+        self._due = 0.0
 
     def _on_training_start(self) -> None:
-        self._saved_at = self.model.num_timesteps
+        self._tried_at = self._saved_at = self.model.num_timesteps
+        self._wait()
 
     def _on_rollout_start(self) -> None:
         # Here, and not in on_step, the replay buffer holds every step taken and the updates have caught up with it.
-        if self.model.num_timesteps - self._saved_at >= self.save_freq:
+        if self.should_stop():
+            raise KeyboardInterrupt
+        if self.save_freq is None:
+            is_due = time.monotonic() >= self._due
+        else:
+            is_due = self.model.num_timesteps - self._tried_at >= self.save_freq
+        if is_due:
             self.save()
 
     def _on_step(self) -> bool:
         return True
 
     def _on_training_end(self) -> None:
-        if self.model.num_timesteps > self._saved_at:
-            self.save()
+        self.save()
 
-    def save(self) -> None:
-        """Write a checkpoint now."""
+    def save(self) -> bool:
+        """Write a checkpoint now, if there is anything new; return whether the file has it all.
+
+        Where it cannot be written, as on a full disk, a warning says so, and the one before stays.
+
+        :raises ValueError: for a run that has gone wrong, whose state is not finite; the one before stays
+        """
         assert isinstance(self.model, SafeSaveMixin)
-        save_tree(self.path, training_state(self.model, self.locals.get("callback")))
-        self._saved_at = self.model.num_timesteps
+        self._tried_at = self.model.num_timesteps
+        if self._tried_at != self._saved_at:
+            state = training_state(self.model, self.locals.get("callback"))
+            check_finite(state, self.path)
+            try:
+                save_tree(self.path, state)
+                self._saved_at = self._tried_at
+            except OSError as error:
+                warnings.warn(
+                    f"The checkpoint of step {self._tried_at} could not be written to {self.path} ({error}). Training "
+                    "goes on; make room, or a crash loses what was learned since the last one.",
+                    stacklevel=2,
+                )
+            self._wait()
+        return self._saved_at == self._tried_at
+
+    def _wait(self) -> None:
+        size = self.path.stat().st_size if self.path.exists() else 0
+        self._due = time.monotonic() + max(SECONDS, size / BYTES_A_SECOND)
+
+
+def check_finite(state: dict[str, Any], path: Path) -> None:
+    """Refuse a state that no training can go on from.
+
+    :param state: as ``training_state`` returns it
+    :param path: of the checkpoint that stays, for the message
+    :raises ValueError: naming what is not finite
+    """
+    for part in ("parameters", "variables", "vec_normalize", "replay_buffer"):
+        for where, value in _numbers(state[part], part):
+            # min and max keep NaN, and need no second array of a replay's size
+            if value.size and not (np.isfinite(value.min()) and np.isfinite(value.max())):
+                raise ValueError(
+                    f"The training has gone wrong: {where} is not finite. No checkpoint is written of it. {path} stays "
+                    "as it was, and --resume goes on from there; find out what made it so (a NaN of the environment, "
+                    "too high a learning rate)."
+                )
+
+
+def _numbers(tree: Any, where: str) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield the arrays and tensors of floating numbers in a tree, each with its place."""
+    if isinstance(tree, (dict, list, tuple)):
+        for key, item in tree.items() if isinstance(tree, dict) else enumerate(tree):
+            yield from _numbers(item, f"{where}[{key!r}]")
+    elif isinstance(tree, (th.Tensor, np.ndarray, np.generic)):
+        array = tree.numpy(force=True) if isinstance(tree, th.Tensor) else np.asarray(tree)
+        if array.dtype.kind == "f":
+            yield where, array
 
 
 def training_state(model: SafeSaveMixin, callback: BaseCallback | None = None) -> dict[str, Any]:
@@ -64,11 +133,10 @@ def training_state(model: SafeSaveMixin, callback: BaseCallback | None = None) -
     :param model: with a replay buffer that has a ``state_dict``
     :param callback: whose ``EvalCallback`` evaluations are kept too
     """
-    statistics = _statistics(model.get_vec_normalize_env())
     return {
         **agent_state(model),
         "replay_buffer": _replay_buffer(model).state_dict(),
-        "vec_normalize": {name: [rms.mean, rms.var, rms.count] for name, rms in statistics.items()},
+        "vec_normalize": get_statistics(model.get_vec_normalize_env()),
         "evaluations": [
             {name: np.array(getattr(evaluation, name)).tolist() for name in _EVALUATION}
             for evaluation in _eval_callbacks(callback)
@@ -90,7 +158,6 @@ def restore_training(model: SafeSaveMixin, path: str | Path, callback: BaseCallb
     :raises ValueError: when the model's replay buffer has no ``load_state_dict``
     """
     replay_buffer, eval_callbacks = _replay_buffer(model), _eval_callbacks(callback)
-    statistics = _statistics(model.get_vec_normalize_env())
     state = load_tree(path)
     with readable(path, explained=(ValueError,)):
         if len(eval_callbacks) != len(state["evaluations"]):
@@ -98,15 +165,13 @@ def restore_training(model: SafeSaveMixin, path: str | Path, callback: BaseCallb
                 f"the run had {len(state['evaluations'])} EvalCallback and is resumed with {len(eval_callbacks)}; "
                 "resume with the callbacks of the run"
             )
-        if statistics.keys() != state["vec_normalize"].keys():
-            raise ValueError(
-                f"in the run VecNormalize normalised {', '.join(state['vec_normalize']) or 'nothing'}, in this model's "
-                f"environment {', '.join(statistics) or 'nothing'}; resume with the environment of the run"
-            )
+        for kept in state["evaluations"]:
+            _check_evaluation(kept)
+        _check_random_state(state["random"])
+        check_statistics(model.get_vec_normalize_env(), state["vec_normalize"])
         restore_agent(model, state)
         replay_buffer.load_state_dict(state["replay_buffer"])
-        for name, rms in statistics.items():
-            rms.mean, rms.var, rms.count = state["vec_normalize"][name]
+        set_statistics(model.get_vec_normalize_env(), state["vec_normalize"])
         for eval_callback, kept in zip(eval_callbacks, state["evaluations"], strict=True):
             for name in _EVALUATION:
                 setattr(eval_callback, name, kept[name])
@@ -132,17 +197,47 @@ def random_state() -> dict[str, Any]:
 def restore_random_state(state: dict[str, Any]) -> None:
     """Restore what ``random_state`` returned.
 
-    :raises SavedFileError: for a position that NumPy's generator never has, which would crash the process
+    :raises SavedFileError: for a state that NumPy's generator never has, which would crash the process
     """
-    version, internal, gauss = state["python"]
-    name, keys, position, *rest = state["numpy"]
-    if name != "MT19937" or type(position) is not int or not 0 <= position <= 624:
-        raise SavedFileError(f"NumPy's random state is {name} at position {position}, expected MT19937 at 0..624")
+    _check_random_state(state)
+    (version, internal, gauss), (name, keys, *rest) = state["python"], state["numpy"]
     random.setstate((version, tuple(internal), gauss))
-    np.random.set_state((name, keys, position, *rest))
+    np.random.set_state((name, keys, *rest))
     th.set_rng_state(state["torch"])
     if "cuda" in state and th.cuda.is_available():
         th.cuda.set_rng_state_all(state["cuda"])
+
+
+def _check_random_state(state: dict[str, Any]) -> None:
+    """:raises SavedFileError: for states that no generator has; their own checks let some pass"""
+    version, internal, gauss = state["python"]
+    random.Random().setstate((version, tuple(internal), gauss))  # raises, and no global generator has changed yet
+    name, keys, position, has_gauss, cached = state["numpy"]
+    if name != "MT19937" or type(position) is not int or not 0 <= position <= 624:
+        raise SavedFileError(f"NumPy's random state is {name!s:.20} at position {position!s:.20}, expected 0..624")
+    if not isinstance(keys, np.ndarray) or (keys.dtype, keys.shape) != (np.uint32, (624,)):
+        raise SavedFileError("NumPy's random state is not of 624 numbers")
+    if has_gauss not in (0, 1) or not all(x is None or _is_finite(x) for x in (gauss, cached)):
+        raise SavedFileError("a random state keeps a number that is not finite for its next draw")
+    probe = th.Generator()
+    probe.set_state(state["torch"])
+    if not th.randn(2, generator=probe, dtype=th.float64).isfinite().all():
+        raise SavedFileError("torch's random state draws numbers that are not finite")
+
+
+def _check_evaluation(saved: dict[str, Any]) -> None:
+    """:raises SavedFileError: for evaluations other than an EvalCallback's"""
+    best, results = saved["best_mean_reward"], [saved[name] for name in _EVALUATION[2:]]
+    if type(saved["n_calls"]) is not int or type(best) is not float or best != best:
+        raise SavedFileError(f"an evaluation has n_calls {saved['n_calls']!s:.20} and the best mean {best!s:.20}")
+    if any(type(rows) is not list or len(rows) != len(results[0]) for rows in results):
+        raise SavedFileError("evaluations differ in how many they are")
+    if any(np.asarray(rows).dtype.kind not in "if" for rows in results if rows):
+        raise SavedFileError("evaluations hold more than numbers")
+
+
+def _is_finite(x: Any) -> bool:
+    return type(x) in (int, float) and math.isfinite(x)
 
 
 def _replay_buffer(model: OffPolicyAlgorithm) -> Any:
@@ -152,16 +247,6 @@ def _replay_buffer(model: OffPolicyAlgorithm) -> Any:
             f"Checkpoints need a replay buffer with a state_dict, such as DelayedReplayBuffer, got {name}."
         )
     return model.replay_buffer
-
-
-def _statistics(vec_normalize: VecNormalize | None) -> dict[str, RunningMeanStd]:
-    """Return what VecNormalize has learned of rewards and observations, and nothing without it."""
-    if vec_normalize is None:
-        return {}
-    observations = vec_normalize.obs_rms if vec_normalize.norm_obs else {}
-    if isinstance(observations, RunningMeanStd):
-        observations = {"observation": observations}
-    return {"return": vec_normalize.ret_rms, **{f"obs/{key}": rms for key, rms in observations.items()}}
 
 
 def _eval_callbacks(callback: BaseCallback | None) -> list[EvalCallback]:

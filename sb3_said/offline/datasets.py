@@ -102,7 +102,7 @@ class Dataset:
             "dones": self.ends.astype(np.float32),
             "timeouts": (self.ends & ~self.terminated).astype(np.float32),
             "ages": ages,
-            "steps": np.arange(len(self), dtype=np.int32) - np.repeat(ends + 1 - lengths, lengths),
+            "steps": (np.arange(len(self)) - np.repeat(ends + 1 - lengths, lengths)).astype(np.int32),
             "ends": np.append(self.ends[:-1], False),  # the newest row's tail is what follows the buffer
         }
         state = {name: column[:, None] for name, column in rows.items()} | {

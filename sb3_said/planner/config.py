@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+import math
+from dataclasses import asdict, dataclass, fields, replace
+from numbers import Integral, Real
 from typing import Any
 
 from sb3_said.planner.diffusion import PREDICTIONS, SCHEDULES, TIME_SAMPLINGS
@@ -11,6 +13,8 @@ from sb3_said.planner.values import VALUE_SCALES
 
 #: Settings that shape a planner's answers and none of its weights.
 SAMPLING_SETTINGS = ("sampling_steps", "n_candidates", "temperature", "scored_states", "choice_factor")
+#: Far beyond what helps: a setting above is a slip, and would ask for memory or hours.
+AT_MOST = {"depth": 1000, "d_model": 16_384, "horizon": 1000, "sampling_steps": 1000, "n_candidates": 10_000}
 
 
 @dataclass(frozen=True)
@@ -75,6 +79,8 @@ class PlannerConfig:
     precision: str = "auto"  # bfloat16 autocast where the hardware has it; or "float32", "bfloat16"
 
     def __post_init__(self) -> None:
+        for field in fields(self):
+            _check_setting(field.name, getattr(self, field.name), field.default)
         for name, choices in (
             ("prediction", PREDICTIONS),
             ("schedule", SCHEDULES),
@@ -148,3 +154,27 @@ class PlannerConfig:
             precision="float32",
         )
         return replace(config, **changes)  # type: ignore[arg-type]
+
+
+def _check_setting(name: str, value: Any, default: Any) -> None:
+    """:raises ValueError: for another type than the default's, a number that is not finite, or one above ``AT_MOST``"""
+    if isinstance(default, bool):
+        fits, expected = isinstance(value, bool), "True or False"
+    elif isinstance(default, int):
+        fits, expected = isinstance(value, Integral) and not isinstance(value, bool), "a whole number"
+    elif isinstance(default, tuple):
+        fits = isinstance(value, (tuple, list)) and len(value) == 2 and all(_is_number(x) and 0 <= x < 1 for x in value)
+        expected = "two numbers in [0, 1)"
+    elif isinstance(default, str):
+        fits, expected = isinstance(value, str), "a name"
+    else:
+        may_lack = name in ("choice_factor", "gradient_clip")
+        fits, expected = _is_number(value) or (may_lack and value is None), "a finite number"
+    if not fits:
+        raise ValueError(f"{name} is {value!r:.50}, expected {expected}.")
+    if name in AT_MOST and value > AT_MOST[name]:
+        raise ValueError(f"{name} is {value}, expected at most {AT_MOST[name]}.")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)

@@ -275,6 +275,10 @@ class PlannerTrainer:
                 + "; ".join(f"{key} was {saved.get(key)} and is now {given.get(key)}" for key in differing)
                 + ". Resume with the old ones, or start a new training."
             )
+        if not _is_finite({name: value for name, value in state.items() if name != "generator"}):
+            raise ValueError("The stored training holds NaN or infinite numbers; start a new one.")
+        if type(state["n_updates"]) is not int or not 0 <= state["n_updates"] <= self.gradient_steps:
+            raise ValueError(f"The stored training made {state['n_updates']} of {self.gradient_steps} updates.")
         state = copy.deepcopy(state)
         self.n_updates = state["n_updates"]
         for name, module in self._modules.items():
@@ -313,3 +317,12 @@ class PlannerTrainer:
             if len(starts):
                 held_out[d] = source.gather(starts, self.average.window_length).to(self.device)
         return held_out
+
+
+def _is_finite(tree: Any) -> bool:
+    """Tell whether all numbers in nested dicts and lists are finite."""
+    if isinstance(tree, (dict, list, tuple)):
+        return all(map(_is_finite, tree.values() if isinstance(tree, dict) else tree))
+    if isinstance(tree, th.Tensor):
+        return bool(tree.isfinite().all())
+    return not isinstance(tree, float) or math.isfinite(tree)

@@ -11,10 +11,10 @@ from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_said.delays.space import EXECUTED, UNDELAYED, check_spaces
+from sb3_said.delays.space import EXECUTED, UNDELAYED, WRAPPER_ORDER, check_spaces
+from sb3_said.replay.checks import check_finite, check_order, true_states
+from sb3_said.replay.stored import ROW_ARRAYS, check_stored
 from sb3_said.replay.windows import Windows, WindowSource
-
-_ROW_ARRAYS = ("observations", "actions", "rewards", "dones", "timeouts", "ages", "steps", "ends")
 
 
 class DelayedReplayBuffer(ReplayBuffer):
@@ -106,21 +106,27 @@ class DelayedReplayBuffer(ReplayBuffer):
         :param next_obs: observation after it; at an episode's end its last one, not the one after reset
         :param action: (n_envs, act_dim) in [-1, 1]
         :param infos: each with ``undelayed_observation`` when the space is delayed
-        :raises ValueError: when the true state is missing, or the past of ``obs`` is neither stored nor empty, or
-            ``next_obs`` is not one action later
+        :raises ValueError: and nothing is stored, for what is not finite, a missing true state, a past of ``obs`` that
+            is neither stored nor empty, a ``next_obs`` that is not one action later, or an observation that is not the
+            state of its age
         """
         obs, next_obs = (x if isinstance(x, dict) else {"observation": x} for x in (obs, next_obs))
         row, previous = self.pos, (self.pos - 1) % self.buffer_size
         continues = self._continues(obs)
         next_states = next_obs["observation"]
         if self.is_delayed:
-            self._check_order(obs, next_obs, continues)
-            if missing := [i for i, info in enumerate(infos) if UNDELAYED not in info]:
-                raise ValueError(
-                    f"The info of environment {missing[0]} has no '{UNDELAYED}', without which the true state is "
-                    "unknown; wrap the task in sb3_said.DelayedObservationWrapper."
-                )
-            next_states = np.stack([info[UNDELAYED] for info in infos])
+            next_states = true_states(infos, self._next_states.shape[1:])
+        parts = {"reward": reward, "action": action, "observation after the action": next_states}
+        if not continues.all():  # else it has been checked, as the last one after an action
+            parts["observation before the action"] = obs["observation"]
+        check_finite(parts, self.n_envs)
+        states = np.where(continues[:, None], self._next_states, obs["observation"])
+        if self.is_delayed:
+            check_order(obs, next_obs, continues, self._starts(obs))
+            # VecNormalize clips an episode's last one. Where each action takes a time of its own, ages count actions.
+            is_state = (np.asarray(done) == 0) & np.array([EXECUTED not in info for info in infos])
+            self._check_shown(next_obs, states, next_states, is_state)
+        timeouts = [bool(info.get("TimeLimit.truncated", False)) for info in infos]  # of a flag or an array of one
         started = np.flatnonzero(~continues)
         for env in np.flatnonzero(self.ends[row]).tolist():  # overwritten
             del self.tails[row, env]
@@ -130,7 +136,7 @@ class DelayedReplayBuffer(ReplayBuffer):
                 self.tails[previous, env] = self._next_states[env].copy(), int(self._next_ages[env])
                 self.ends[previous, env] = True
 
-        self.observations[row] = np.where(continues[:, None], self._next_states, obs["observation"])
+        self.observations[row] = states
         self.steps[row] = np.where(continues, self.steps[previous] + 1, 0)
         self.ages[row] = obs["delay"].reshape(self.n_envs) if self.is_delayed else 0
         sent = next_obs["action_history"][:, -1] if self.max_delay > 0 else action
@@ -142,7 +148,7 @@ class DelayedReplayBuffer(ReplayBuffer):
         self.rewards[row] = reward
         self.dones[row] = done
         if self.handle_timeout_termination:
-            self.timeouts[row] = [info.get("TimeLimit.truncated", False) for info in infos]
+            self.timeouts[row] = timeouts
 
         self._next_states[:] = next_states
         self._next_ages[:] = next_obs["delay"].reshape(self.n_envs) if self.is_delayed else 0
@@ -177,23 +183,25 @@ class DelayedReplayBuffer(ReplayBuffer):
         past = (obs[key].reshape(self.n_envs, -1) for key in ("delay", "action_history"))
         return np.logical_and.reduce([np.all(part == 0, axis=1) for part in past])
 
-    def _check_order(self, obs: dict[str, np.ndarray], next_obs: dict[str, np.ndarray], continues: np.ndarray) -> None:
-        """:raises ValueError: for a transition that, as histories and ages tell, is out of order"""
-        history = obs["action_history"]
-        if (joined := np.flatnonzero(~continues & ~self._starts(obs))).size:
-            env = joined[0]
+    def _check_shown(
+        self, next_obs: dict[str, np.ndarray], states: np.ndarray, next_states: np.ndarray, is_state: np.ndarray
+    ) -> None:
+        """Refuse observations that are not the states of their ages, which sampling would show in their place.
+
+        :param states: (n_envs, obs_dim), true ones before the action, whose row is still to be written
+        :param next_states: (n_envs, obs_dim), true ones after it
+        :param is_state: (n_envs,) bool, where the observation must be the state of its age
+        :raises ValueError: naming the environment
+        """
+        ages = next_obs["delay"].reshape(self.n_envs).astype(np.int64)
+        shown = self.observations[(self.pos + 1 - ages) % self.buffer_size, np.arange(self.n_envs)]
+        shown[ages == 1], shown[ages == 0] = states[ages == 1], next_states[ages == 0]
+        differs = np.any(shown != next_obs["observation"], axis=1) & is_state
+        if differs.any():
+            env = np.argmax(differs)
             raise ValueError(
-                f"The first observation of an episode must have age 0 and an empty past, but that of environment {env} "
-                f"has {np.any(history[env] != 0, axis=-1).sum()} actions sent before it and is "
-                f"{obs['delay'][env, 0]:.0f} steps old: transitions must be added in the order they happened. Empty or "
-                "replace a replay between two calls of learn(), which then starts new episodes, not during one."
-            )
-        differs = next_obs["action_history"][:, :-1] != history[:, 1:]
-        if differs.any():  # a step between the two was not added
-            raise ValueError(
-                f"The observation after the action of environment {np.argwhere(differs)[0, 0]} does not follow the "
-                "one before it: its action_history is not the same with one action more. Transitions must be added in "
-                "the order they happened, and each of them."
+                f"The observation of environment {env} has age {ages[env]}, but is not the state of {ages[env]} steps "
+                f"before. {WRAPPER_ORDER}"
             )
 
     def reset(self) -> None:
@@ -367,34 +375,26 @@ class DelayedReplayBuffer(ReplayBuffer):
             "next_states": self._next_states,
             "next_ages": self._next_ages,
             "tail_places": np.array([*self.tails], np.int64).reshape(-1, 2),
-            "tail_states": np.array([state for state, _ in self.tails.values()], np.float32),
+            "tail_states": np.array([x for x, _ in self.tails.values()], np.float32).reshape(
+                -1, self.observations.shape[2]
+            ),
             "tail_ages": np.array([age for _, age in self.tails.values()], np.int16),
-            **{name: getattr(self, name)[: self.size()] for name in _ROW_ARRAYS},
+            **{name: getattr(self, name)[: self.size()] for name in ROW_ARRAYS},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what ``state_dict`` returned.
+        """Restore what ``state_dict`` returned; nothing changes unless all of it fits.
 
-        :raises ValueError: when it came from a buffer of another shape
+        :raises ValueError: when it came from a buffer of another shape, or holds what no buffer stores
         """
-        size, space, expected = len(state["rewards"]), self.observation_space, state["expected"]
-        fits = size == self.buffer_size if state["full"] else size == state["pos"] <= self.buffer_size
-        fits = fits and all(state[name].shape[1:] == getattr(self, name).shape[1:] for name in _ROW_ARRAYS)
-        if expected is not None:  # the observation that would continue the replay is of this buffer's task
-            boxes = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
-            sizes = {key: self.n_envs * int(np.prod(box.shape)) for key, box in boxes.items()}  # type: ignore[arg-type]  # Boxes
-            fits = fits and sizes == {key: x.size for key, x in expected.items()}
-        if not fits:
-            raise ValueError(
-                f"A stored replay of shape {state['observations'].shape} does not fit a buffer of shape "
-                f"{self.observations.shape}; use the buffer_size, n_envs, task and max_delay it was made with."
-            )
-        self.pos, self.full, self._expected = state["pos"], state["full"], expected
+        size = len(state["rewards"])
+        check_stored(self, state)
+        self.pos, self.full, self._expected = state["pos"], state["full"], state["expected"]
         self._next_states, self._next_ages = state["next_states"].copy(), state["next_ages"].copy()
         places = map(tuple, state["tail_places"].tolist())
         self.tails = dict(
             zip(places, zip(state["tail_states"].copy(), state["tail_ages"].tolist(), strict=True), strict=True)
         )
-        for name in _ROW_ARRAYS:
+        for name in ROW_ARRAYS:
             getattr(self, name)[:size] = state[name]
         self.ends[size:] = False  # of whatever was stored before

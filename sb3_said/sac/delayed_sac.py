@@ -10,16 +10,18 @@ from difflib import get_close_matches
 from typing import Any, ClassVar
 
 import numpy as np
+from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn, Schedule
+from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
-from sb3_said.delays.space import ages_of, check_spaces, written_ages
+from sb3_said.delays.space import ages_of, check_one_max_delay, check_spaces, written_ages
 from sb3_said.files.agents import SafeSaveMixin
-from sb3_said.files.archive import load_tree, save_tree
+from sb3_said.files.archive import load_tree, readable, save_tree
 from sb3_said.replay.buffer import DelayedReplayBuffer
-from sb3_said.sac.policies import DelayedSACPolicy
+from sb3_said.sac.policies import DelayedSACPolicy, as_array
 
 
 class DelayedSAC(SafeSaveMixin, SAC):
@@ -113,18 +115,25 @@ class DelayedSAC(SafeSaveMixin, SAC):
         own, given = {*self._policy_flags(), "relabelled_ages"}, {*self.policy_kwargs, *self.replay_buffer_kwargs}
         if twice := sorted(own & given):
             raise ValueError(f"Give {', '.join(twice)} to {name} itself, not in policy_kwargs or replay_buffer_kwargs.")
-        vec_normalize = self.get_vec_normalize_env()
+        if self.env is not None:
+            self._check_env(self.env)
+        user_kwargs = self.policy_kwargs, self.replay_buffer_kwargs
+        self.policy_kwargs = {**self.policy_kwargs, **self._policy_flags()}
+        self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "relabelled_ages": self.relabelled_ages}
+        super()._setup_model()
+        self.policy_kwargs, self.replay_buffer_kwargs = user_kwargs
+
+    def _check_env(self, env: GymEnv) -> None:
+        """Refuse spaces that are not served, and what no space tells of an environment, with a ``ValueError``."""
+        check_spaces(env.observation_space, env.action_space)
+        check_one_max_delay(env)
+        vec_normalize = unwrap_vec_normalize(env)  # type: ignore[arg-type]  # None for one that is no VecEnv
         keys = [] if vec_normalize is None or not vec_normalize.norm_obs else vec_normalize.norm_obs_keys or []
         if not set(keys) <= {"observation"}:
             raise ValueError(
                 f"VecNormalize must leave actions and ages as they are, but normalises {', '.join(sorted(keys))}; "
                 "use VecNormalize(..., norm_obs_keys=['observation'])."
             )
-        user_kwargs = self.policy_kwargs, self.replay_buffer_kwargs
-        self.policy_kwargs = {**self.policy_kwargs, **self._policy_flags()}
-        self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "relabelled_ages": self.relabelled_ages}
-        super()._setup_model()
-        self.policy_kwargs, self.replay_buffer_kwargs = user_kwargs
 
     def _policy_flags(self) -> dict[str, Any]:
         """Return what the policy's constructor needs of this algorithm's own arguments."""
@@ -152,7 +161,18 @@ class DelayedSAC(SafeSaveMixin, SAC):
                 self._last_obs = None
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """Take another environment, as SB3 does; see :meth:`check_ages` for one with another delay."""
+        """Take another environment, as SB3 does; see :meth:`check_ages` for one with another delay.
+
+        :raises ValueError: for other spaces, another ``max_delay`` or a ``VecNormalize`` of more than the observation
+        """
+        self._check_env(env)
+        is_delayed = isinstance(self.observation_space, spaces.Dict)
+        if is_delayed != isinstance(env.observation_space, spaces.Dict):
+            remedy = f"give it DelayedObservationWrapper(..., max_delay={self.policy.max_delay})"
+            raise ValueError(
+                f"This {type(self).__name__} was built for a task {'in' if is_delayed else 'without'} a "
+                f"DelayedObservationWrapper, got {env.observation_space}; {remedy if is_delayed else 'leave it out'}."
+            )
         own, given = self.policy.max_delay, check_spaces(env.observation_space, self.action_space)[1]
         if own != given:
             raise ValueError(
@@ -187,10 +207,10 @@ class DelayedSAC(SafeSaveMixin, SAC):
         """Answer as SB3 does, and warn like :meth:`check_ages` where observations amid an episode have other ages."""
         answer = super().predict(observation, state, episode_start, deterministic)
         if isinstance(observation, dict) and self.trained_ages is not None:
-            ages = np.ravel(observation["delay"])  # (B,)
+            ages = np.ravel(as_array(observation["delay"]))  # (B,)
             if not set(ages.tolist()) <= set(self.trained_ages):
                 # As many actions as the history holds have been sent: no younger age is due to the episode's start.
-                history = np.reshape(observation["action_history"], (len(ages), self.policy.max_delay, -1))
+                history = as_array(observation["action_history"]).reshape(len(ages), self.policy.max_delay, -1)
                 self.check_ages(sorted({int(age) for age in ages[history[:, 0].any(1)]}))
         return answer
 
@@ -206,6 +226,20 @@ class DelayedSAC(SafeSaveMixin, SAC):
 
         :param path: of the file, or a binary file object
         :param truncate_last_traj: of SB3's ``HerReplayBuffer``, without effect here
-        :raises ValueError: when the file is no replay, or was made with another task, ``buffer_size`` or ``n_envs``
+        :raises SavedFileError: when the file is no replay, is damaged or forged, or was made with another task,
+            ``buffer_size`` or ``n_envs``
         """
-        self.replay_buffer.load_state_dict(load_tree(path))  # type: ignore[arg-type]  # io.BufferedIOBase is IO
+        state = load_tree(path)  # type: ignore[arg-type]  # io.BufferedIOBase is IO
+        if self.replay_buffer is None:
+            self.replay_buffer = self.replay_buffer_class(
+                self.buffer_size,
+                self.observation_space,
+                self.action_space,
+                self.device,
+                self.n_envs,
+                relabelled_ages=self.relabelled_ages,
+                **self.replay_buffer_kwargs,
+            )
+        with readable(path, explained=(ValueError,)):  # type: ignore[arg-type]
+            self.replay_buffer.load_state_dict(state)
+        self.replay_buffer.device = self.device

@@ -16,6 +16,11 @@ from sb3_said.delays.space import UNDELAYED, check_spaces
 from sb3_said.files.agents import SafePolicyMixin
 from sb3_said.sac.extractors import KeyExtractor, StateAugmentedExtractor
 
+NOT_FINITE = (
+    "The action is not finite: the observation is far larger than those of training, or the agent's weights are "
+    "damaged, or its training diverged."
+)
+
 
 class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
     """SAC's policy for delayed observations; for a plain 1-D Box it computes what SB3's ``SACPolicy`` does.
@@ -115,13 +120,16 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         if not np.isfinite(actions).all():
             parts = observation.values() if isinstance(observation, dict) else [observation]
             largest = max(float(np.abs(part).max(initial=0.0)) for part in parts)
-            raise ValueError(
-                f"The action is not finite. The largest entry of the observation is {largest:.3g}: keep it near what "
-                "the agent was trained on; else the agent's own weights are not finite, and its training diverged."
-            )
+            raise ValueError(f"{NOT_FINITE} The largest entry of the observation is {largest:.3g}.")
         space = self.action_space
         assert isinstance(space, spaces.Box)  # as check_spaces says
         return np.clip(actions, space.low, space.high), state  # scaling to the bounds may round to beyond them
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        try:
+            return super()._predict(observation, deterministic)
+        except ValueError as error:  # of torch's distributions, about a NaN
+            raise ValueError(NOT_FINITE) from error
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {
@@ -129,6 +137,14 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
             "augment_state": self.augment_state,
             "delay_reconciled_critic": self.delay_reconciled_critic,
         }
+
+
+def as_array(given: Any) -> np.ndarray:
+    """Return numbers as an array, those of a tensor from any device, with or without a gradient."""
+    if isinstance(given, th.Tensor):
+        given = given.detach().cpu()
+        given = given.float() if given.is_floating_point() else given  # NumPy has no bfloat16
+    return np.asarray(given)
 
 
 def _as_float32(name: str, given: Any, space: spaces.Space[Any]) -> np.ndarray:
@@ -140,7 +156,7 @@ def _as_float32(name: str, given: Any, space: spaces.Space[Any]) -> np.ndarray:
     :raises ValueError: for what is no array of real numbers, another shape, an empty batch, or entries not finite
     """
     try:
-        array = np.asarray(given)
+        array = as_array(given)
     except ValueError as error:
         raise ValueError(f"{name} cannot be made an array: {error}") from error
     if array.dtype.kind not in "biuf":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ class PlannerTrainingCallback(BaseCallback):
 
     :param folder: keep a checkpoint of the planner's training there, and continue from it
     :param progress_bar: show one
+    :param should_stop: asked after every update; a training that it ends writes its checkpoint and raises
+        ``KeyboardInterrupt``
     :param intervals: in updates, ``log_interval``, ``eval_interval`` or ``save_interval`` of
         :meth:`~sb3_said.said.SAID.train_planner`
     :raises TypeError: for another name
@@ -24,12 +27,18 @@ class PlannerTrainingCallback(BaseCallback):
     model: Any  # SAID, whose module imports this one
 
     def __init__(
-        self, folder: str | Path | None = None, progress_bar: bool = False, verbose: int = 0, **intervals: int
+        self,
+        folder: str | Path | None = None,
+        progress_bar: bool = False,
+        verbose: int = 0,
+        should_stop: Callable[[], bool] | None = None,
+        **intervals: int,
     ):
         super().__init__(verbose)
         if unknown := sorted(set(intervals) - {"log_interval", "eval_interval", "save_interval"}):
             raise TypeError(f"PlannerTrainingCallback has no argument {', '.join(unknown)}.")
-        self.how: dict[str, Any] = {"folder": folder, "progress_bar": progress_bar, **intervals}
+        self.how: dict[str, Any] = {"folder": folder, "progress_bar": progress_bar, "should_stop": should_stop}
+        self.how |= intervals
 
     def _on_training_start(self) -> None:
         if self.model.num_timesteps < self.model._planner_trained_at:  # counting began anew

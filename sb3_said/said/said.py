@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -13,6 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import configure_logger
+from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from sb3_said.delays.space import ages_of, has_state_history
 from sb3_said.offline import IQL, ImplicitValues, OfflineAlgorithm, load_dataset
@@ -102,13 +104,16 @@ class SAID(OfflineAlgorithm):
         policy = getattr(self, "policy", None)
         return self._given_planner_kwargs if policy is None else policy.planner.config.to_dict()
 
-    def _setup_model(self) -> None:
-        vec_normalize = self.get_vec_normalize_env()
-        if has_state_history(self.observation_space) and vec_normalize is not None and vec_normalize.norm_obs:
+    def _check_env(self, env: GymEnv) -> None:
+        super()._check_env(env)
+        vec_normalize = unwrap_vec_normalize(env)  # type: ignore[arg-type]  # None for one that is no VecEnv
+        if has_state_history(env.observation_space) and vec_normalize is not None and vec_normalize.norm_obs:
             raise ValueError(
                 "VecNormalize scales the observation and not the state_history, which must have the same units; use "
                 "VecNormalize(..., norm_obs=False), or leave state_history=False in DelayedObservationWrapper."
             )
+
+    def _setup_model(self) -> None:
         super()._setup_model()
         if self.trained_ages is None and self.env is not None:  # else it was loaded, and check_ages says it
             try:
@@ -217,6 +222,7 @@ class SAID(OfflineAlgorithm):
     @th.no_grad()
     def _stored_values(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """Return values as the environment's rewards would sum up, of states as windows have them: (B,)."""
+        self.critic.set_training_mode(False)  # until the next update; batch norm must not learn from this
         values = self.policy.q_value(states.to(self.device), actions.to(self.device)).cpu()
         env = self._vec_normalize_env
         return values if env is None else th.from_numpy(env.unnormalize_reward(values.numpy()))
@@ -230,6 +236,7 @@ class SAID(OfflineAlgorithm):
         eval_interval: int = 2_000,
         save_interval: int = 1_000,
         trial_episodes: int | None = None,
+        should_stop: Callable[[], bool] | None = None,
     ) -> None:
         """Train the planner anew on the replay buffer, without running the expert; then see who answers better.
 
@@ -246,36 +253,33 @@ class SAID(OfflineAlgorithm):
         :param eval_interval: updates between two measurements of the held-out errors, beside the regression's
         :param save_interval: updates between two checkpoints
         :param trial_episodes: ``planner_trial_episodes`` by default; none are played where there is no environment
+        :param should_stop: asked after every update; where it says so, a checkpoint is written and the training ends
+        :raises KeyboardInterrupt: when ``should_stop`` has ended the training
         :raises ValueError: when the buffer is empty, or the checkpoint is of a training with other settings
         :raises FloatingPointError: when an update was not finite
         """
         if not hasattr(self, "_logger"):  # not set_logger: learn() makes its own
             self._logger = configure_logger(self.verbose, self.tensorboard_log, "SAID", reset_num_timesteps=False)
-        if not progress_bar and self.verbose == 0:
-            total = self.planner_gradient_steps if gradient_steps is None else gradient_steps
-            print(
-                f"Training the planner: {total} updates. progress_bar=True or verbose=1 shows how far it is.",
-                flush=True,
-            )
 
         def row(n_updates: int) -> int:
             return self.num_timesteps + (n_updates if self.planner_train_freq is None else 0)
 
-        training = PlannerTraining(
-            self, self.make_planner_trainer(gradient_steps), self._make_value_trainer(), folder, row
-        )
-        intervals: dict[str, Any] = {
-            "log_interval": log_interval,
-            "eval_interval": eval_interval,
-            "save_interval": save_interval,
-        }
-        if not training.run(progress_bar, **intervals):
-            trial_episodes = 0
-        if training.trainer.n_updates > 0:
+        trainer, intervals = self.make_planner_trainer(gradient_steps), (log_interval, eval_interval, save_interval)
+        training = PlannerTraining(self, trainer, self._make_value_trainer(), row, folder, *intervals)
+        if trainer.n_updates < trainer.gradient_steps and not progress_bar and self.verbose == 0:
+            print(
+                f"Training the planner: {trainer.gradient_steps} updates. progress_bar=True or verbose=1 shows how far "
+                "it is.",
+                flush=True,
+            )
+        outcome = training.run(progress_bar, should_stop)
+        if trainer.n_updates > 0:
             self.set_answer("planner")
             n_episodes = self.planner_trial_episodes if trial_episodes is None else trial_episodes
-            if n_episodes > 0 and self.env is not None:
+            if outcome == "done" and n_episodes > 0 and self.env is not None:
                 training.log(let_the_better_answer(self, n_episodes, progress_bar))
+        if outcome == "stopped":
+            raise KeyboardInterrupt
         self._planner_trained_at = self.num_timesteps
 
     def _make_value_trainer(self) -> IQL | None:
@@ -305,7 +309,9 @@ class SAID(OfflineAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
         folder: str | Path | None = None,
-        **intervals: Any,
+        eval_interval: int = 2_000,
+        save_interval: int = 1_000,
+        should_stop: Callable[[], bool] | None = None,
     ) -> SelfSAID:
         """Train the planner, and V(s) beside it, on logs of a task without delay (paper, Algorithm 2).
 
@@ -320,16 +326,19 @@ class SAID(OfflineAlgorithm):
         :param reset_num_timesteps: has no effect: each training of a planner begins anew
         :param progress_bar: show one
         :param folder: keep a checkpoint there, and continue from it if it is of the same training
-        :param intervals: ``eval_interval`` and ``save_interval`` of :meth:`train_planner`
+        :param eval_interval: updates between two measurements of the held-out errors
+        :param save_interval: updates between two checkpoints
+        :param should_stop: as of :meth:`train_planner`
+        :raises KeyboardInterrupt: when ``should_stop`` has ended the training
         :raises ValueError: as ``load_dataset`` and :meth:`train_planner` do
         """
         total = self.planner_gradient_steps if gradient_steps is None else gradient_steps
         self.value = "iql"
         self.policy.set_value("iql")
         watcher = self._begin_offline(dataset, total, callback, tb_log_name, True, progress_bar)
-        training = PlannerTraining(
-            self, self.make_planner_trainer(total), self._make_value_trainer(), folder, row=lambda n_updates: n_updates
-        )
+        trainer, values = self.make_planner_trainer(total), self._make_value_trainer()
+        intervals = log_interval, eval_interval, save_interval
+        training = PlannerTraining(self, trainer, values, lambda n_updates: n_updates, folder, *intervals)
 
         def on_step(n_updates: int) -> bool:
             self.num_timesteps = n_updates
@@ -337,8 +346,10 @@ class SAID(OfflineAlgorithm):
                 training.hand_over()
             return self._goes_on(watcher)
 
-        training.run(on_step=on_step, log_interval=log_interval, **intervals)
-        if training.trainer.n_updates > 0:
+        outcome = training.run(should_stop=should_stop, on_step=on_step)
+        if trainer.n_updates > 0:
             self.set_answer("planner")
+        if outcome == "stopped":
+            raise KeyboardInterrupt
         watcher.on_training_end()
         return self

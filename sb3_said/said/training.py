@@ -6,12 +6,12 @@ import warnings
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from stable_baselines3.common.logger import Logger
 from tqdm.auto import tqdm
 
-from sb3_said.files.archive import load_tree, save_tree
+from sb3_said.files.archive import load_tree, readable, save_tree
 from sb3_said.offline.iql import IQL
 from sb3_said.planner.trainer import PlannerTrainer, worse_than_regression
 
@@ -26,9 +26,12 @@ class PlannerTraining:
     :param model: whose planner it is
     :param trainer: of the planner
     :param values: trained beside it, None for none
-    :param folder: keep a checkpoint there, and continue from it if it is of the same training
     :param row: maps the updates made to where in the log their row stands
-    :raises ValueError: when the checkpoint is of a training with other settings
+    :param folder: keep a checkpoint there, and continue from it if it is of the same training
+    :param log_interval: updates between two rows of losses in the log
+    :param eval_interval: updates between two measurements of the held-out errors, beside the regression's
+    :param save_interval: updates between two checkpoints
+    :raises SavedFileError: when the checkpoint is damaged, or of a training with other settings
     """
 
     def __init__(
@@ -36,59 +39,64 @@ class PlannerTraining:
         model: SAID,
         trainer: PlannerTrainer,
         values: IQL | None,
-        folder: str | Path | None,
         row: Callable[[int], int],
+        folder: str | Path | None = None,
+        log_interval: int = 500,
+        eval_interval: int = 2_000,
+        save_interval: int = 1_000,
     ):
         self.model, self.trainer, self.values, self.row = model, trainer, values, row
+        self.log_interval, self.eval_interval, self.save_interval = log_interval, eval_interval, save_interval
         self.checkpoint = None if folder is None else Path(folder) / PLANNER_CHECKPOINT_NAME
         replay = model.replay_buffer.actions[: model.replay_buffer.size()]
         self._data = {"num_timesteps": model.num_timesteps, "replay": zlib.crc32(replay.data)}
         self._value_losses: dict[str, float] = {}
         if self.checkpoint is not None and self.checkpoint.exists():
             state = load_tree(self.checkpoint)
-            if {key: state[key] for key in self._data} == self._data:
-                trainer.load_state_dict(state["trainer"])
-                if values is not None:
-                    values.load_state_dict(state["values"])
+            with readable(self.checkpoint, explained=(ValueError,)):
+                if {key: state[key] for key in self._data} == self._data:
+                    trainer.load_state_dict(state["trainer"])
+                    if values is not None:
+                        values.load_state_dict(state["values"])
 
     def run(
         self,
         progress_bar: bool = False,
+        should_stop: Callable[[], bool] | None = None,
         on_step: Callable[[int], bool] | None = None,
-        *,
-        log_interval: int = 500,
-        eval_interval: int = 2_000,
-        save_interval: int = 1_000,
-    ) -> bool:
-        """Make all updates that are left. Ctrl-C ends the training early and keeps the planner as far as it got.
+    ) -> Literal["done", "interrupted", "stopped"]:
+        """Make all updates that are left, and hand over. Ctrl-C ends the training early and keeps what was learned.
 
-        :param on_step: called with the number of updates made after each; training stops when it returns False
-        :return: whether it was not interrupted
+        :param should_stop: asked after every update; where it says so, a checkpoint is written and the training ends
+        :param on_step: called with the number of updates made after each; the training ends when it returns False
+        :return: ``"interrupted"`` after Ctrl-C, ``"stopped"`` by ``should_stop``
         """
         trainer, total = self.trainer, self.trainer.gradient_steps
+        outcome: Literal["done", "interrupted", "stopped"] = "done"
 
         def on_update(trainer: PlannerTrainer) -> bool:
+            nonlocal outcome
             bar.update()
             done = trainer.n_updates
             is_end = done == total
             self._train_values()
-            if done % log_interval == 0 or is_end:
-                bar.set_postfix(loss=self._log_row(done % eval_interval == 0 or is_end))
-            if self.checkpoint is not None and (done % save_interval == 0 or is_end):
-                self._save(self.checkpoint)
-            return on_step is None or on_step(done)
+            if done % self.log_interval == 0 or is_end:
+                bar.set_postfix(loss=self._log_row(done % self.eval_interval == 0 or is_end))
+            outcome = "stopped" if should_stop is not None and should_stop() else "done"
+            if self.checkpoint is not None and (done % self.save_interval == 0 or is_end or outcome == "stopped"):
+                self._save_or_warn(self.checkpoint)
+            return outcome == "done" and (on_step is None or on_step(done))
 
-        is_interrupted = False
         with tqdm(total=total, initial=trainer.n_updates, desc="planner", disable=not progress_bar) as bar:
             try:
                 trainer.train(callback=on_update)
             except KeyboardInterrupt:
-                is_interrupted = True
-        if is_interrupted:
-            outcome = "keeps what it learned" if trainer.n_updates > 0 else "stays as it was"
-            print(f"Planner training interrupted after {trainer.n_updates} of {total} updates; it {outcome}.")
+                outcome = "interrupted"
+        if outcome == "interrupted":
+            result = "keeps what it learned" if trainer.n_updates > 0 else "stays as it was"
+            print(f"Planner training interrupted after {trainer.n_updates} of {total} updates; it {result}.")
         self.hand_over()
-        return not is_interrupted
+        return outcome
 
     def hand_over(self) -> None:
         """Give the agent the planner and the values as far as they got; before the first update, leave it as it is.
@@ -129,6 +137,14 @@ class PlannerTraining:
             )
         return losses["planner/loss"]
 
-    def _save(self, path: Path) -> None:
+    def _save_or_warn(self, checkpoint: Path) -> None:
+        """Write a checkpoint; a full disk is no reason to lose the planner itself."""
         values = None if self.values is None else self.values.state_dict()
-        save_tree(path, {**self._data, "trainer": self.trainer.state_dict(), "values": values})
+        try:
+            save_tree(checkpoint, {**self._data, "trainer": self.trainer.state_dict(), "values": values})
+        except OSError as error:
+            warnings.warn(
+                f"The planner's checkpoint could not be written to {checkpoint} ({error}). Training goes on, and the "
+                "agent keeps its planner; make room, so that it can be saved.",
+                stacklevel=6,
+            )

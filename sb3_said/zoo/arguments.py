@@ -17,7 +17,7 @@ DELAY_HELP = (
     "docs/delays.md in quotes, such as 'DroppedPackets(4, p=0.1)'"
 )
 
-TRUST = "A run folder's YAML can run code, since rl_zoo3 reads it so: open only folders that you trust."
+TRUST = "Opening a run runs no code from its files, but imports the installed packages that its run.json names."
 
 
 def make_parser(description: str | None, epilog: str, **kwargs: Any) -> argparse.ArgumentParser:
@@ -42,6 +42,10 @@ def add_playing(parser: argparse.ArgumentParser, episodes: int) -> None:
     parser.add_argument("--episodes", type=int, default=episodes, help=f"whole episodes to play (default: {episodes})")
     parser.add_argument("--seed", type=int, default=10_000, help="reset seed of the first episode (default: 10000)")
     parser.add_argument("--device", default="auto", help="torch device (default: auto)")
+    parser.add_argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules to import that "
+                        "register the task, beside those that its run remembers")  # fmt: skip
+    parser.add_argument("--num-threads", type=int, default=1, help="torch threads: one decision is too small for "
+                        "several, which wait for each other on a busy machine (default: 1)")  # fmt: skip
 
 
 def add_run(parser: argparse.ArgumentParser, episodes: int) -> None:

@@ -1,67 +1,62 @@
-"""Write what a search found as YAML: a best.yml to train with, and the settings beside best.zip to play it with."""
+"""Write what a search found: a best.yml to train with, and beside best.zip what makes its task."""
 
 from __future__ import annotations
 
 import shlex
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from sb3_said.files.atomic import write_text
-from sb3_said.zoo.manager import WRAPPER, read_arguments
-from sb3_said.zoo.runs import read_params
-from sb3_said.zoo.train import own_parser
+from sb3_said.files.normalization import normalization_file
+from sb3_said.zoo.record import Record
 
 
 def write_best(run: Path, folder: Path, planner: dict[str, Any], choice: str) -> str:
     """Write the YAML of a tuned run, and return the command that trains with it.
-
-    The run's YAML can run code: tune only runs that you trust.
 
     :param run: folder of the run that was tuned
     :param folder: to write to
     :param planner: its settings that were tried
     :param choice: how they were chosen, for a comment
     """
-    params = next(run.glob("*/args.yml")).parent
-    config = dict(yaml.load((params / "config.yml").read_text(), Loader=yaml.UnsafeLoader))
-    config["planner_kwargs"] = {**(config.get("planner_kwargs") or {}), **planner}
-    beside = shutil.copytree(params, folder / params.name, dirs_exist_ok=True)  # VecNormalize's statistics, too
-    write_text(beside / "config.yml", yaml.dump(config))
+    record = Record.read(run)
+    hyperparams = {
+        **record.hyperparams,
+        "planner_kwargs": {**(record.hyperparams.get("planner_kwargs") or {}), **planner},
+    }
+    record = replace(record, hyperparams=hyperparams)
+    record.write(folder)  # what makes the task of best.zip
+    if (statistics := normalization_file(run / record.agent_name)).exists():
+        shutil.copyfile(statistics, normalization_file(folder / record.agent_name))  # of all agents there
 
-    args = read_params(params)[1]
-    options, _ = own_parser().parse_known_args(read_arguments(run))
-    words = ["sb3-said", "train", "--algo", "said", "--env", args["env"]]
-    for name, delay in (("--delay", options.delay), ("--expert-delay", options.expert_delay)):
-        words += [name, *delay] if delay else []
+    words = ["sb3-said", "train", "--algo", "said", "--env", record.env]
+    for name, delay in (("--delay", record.delay), ("--expert-delay", record.expert_delay)):
+        words += [name, *map(str, delay if isinstance(delay, list) else [delay])] if delay is not None else []
+    if record.gym_packages:
+        words += ["--gym-packages", *record.gym_packages]
     command = shlex.join([*words, "-conf", str(folder / "best.yml")])
 
-    block, left_out = plain_settings(config, args)
+    block, left_out = plain_settings(record)
     lines = [f"{', '.join(planner)}: {choice}; see results.json.", command]
     lines += [f"Left out, as YAML cannot hold it: {name}" for name in left_out]
-    text = "".join(f"# {line}\n" for line in lines) + yaml.safe_dump({args["env"]: block}, sort_keys=False)
+    text = "".join(f"# {line}\n" for line in lines) + yaml.safe_dump({record.env: block}, sort_keys=False)
     write_text(folder / "best.yml", text)
     return command
 
 
-def plain_settings(config: dict[str, Any], args: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+def plain_settings(record: Record) -> tuple[dict[str, Any], list[str]]:
     """Return hyper-parameters as rl_zoo3 reads them from YAML, and the names of those that YAML cannot hold.
 
-    The wrapper of the delay is left out, since ``--delay`` adds it.
-
-    :param config: a run's config.yml
-    :param args: its command line, whose settings beside the hyper-parameters are taken in
+    :param record: of a run, whose settings beside the hyper-parameters are taken in
     """
-    wrappers = config.get("env_wrapper") or []
-    wrappers = wrappers if isinstance(wrappers, list) else [wrappers]
-    given = {**config, "env_wrapper": [w for w in wrappers if not (isinstance(w, dict) and WRAPPER in w)]}
-    given |= {"env_kwargs": args["env_kwargs"]} if args.get("env_kwargs") else {}
-    given |= {"n_timesteps": args["n_timesteps"]} if args.get("n_timesteps", -1) > 0 else {}
-    if not given["env_wrapper"]:
-        del given["env_wrapper"]
-    block, left_out = {}, []
+    given = {name: value for name, value in record.hyperparams.items() if name != "env_wrapper" or value}
+    given |= {"env_kwargs": record.env_kwargs} if record.env_kwargs else {}
+    given |= {"n_timesteps": n} if (n := record.options.get("n_timesteps", -1)) > 0 else {}
+    block, left_out = {}, list(record.missing)
     for name, value in given.items():
         try:
             block[name] = yaml.safe_load(yaml.safe_dump(value))

@@ -8,17 +8,17 @@ from typing import Any
 from sb3_said import SAID
 from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.zoo.arguments import TRUST, explained, make_parser
-from sb3_said.zoo.runs import find_agent, read_params
+from sb3_said.zoo.runs import find_agent
 
 EPILOG = f"""\
 examples:
   # how the agent decides now
-  sb3-said decide logs/said/Hopper-v5-delay4_1
+  sb3-said decide logs/said/Hopper-v5-delay4-seed1_1
 
   # the critics weigh 16 candidates; beside the run's own agent, so that the other commands know its task
-  sb3-said decide logs/said/Hopper-v5-delay4_1 --temperature 1 --n-candidates 16 --choice-factor 1 \\
-      -o logs/said/Hopper-v5-delay4_1/weighed.zip
-  sb3-said evaluate logs/said/Hopper-v5-delay4_1/weighed.zip
+  sb3-said decide logs/said/Hopper-v5-delay4-seed1_1 --temperature 1 --n-candidates 16 --choice-factor 1 \\
+      -o logs/said/Hopper-v5-delay4-seed1_1/weighed.zip
+  sb3-said evaluate logs/said/Hopper-v5-delay4-seed1_1/weighed.zip
 
   # the fastest decision: one candidate, one denoising step
   sb3-said decide hopper.zip --temperature 0 --sampling-steps 1 -o hopper_fast.zip
@@ -76,8 +76,8 @@ def load_said(path: Path) -> SAID:
 
     :raises ValueError: when it is not a SAID agent
     """
-    file, params = find_agent(path)
-    algo = read_params(params)[1].get("algo", "said")
+    file, record = find_agent(path)
+    algo = "said" if record is None else record.algo
     if algo != "said":
         raise ValueError(f"{path} is a run of '{algo}', which has no planner; give one of --algo said.")
     return SAID.load(file, device="cpu")

@@ -11,10 +11,11 @@ import torch as th
 from filelock import FileLock, Timeout
 from stable_baselines3.common.logger import Logger, make_output_format
 
-from sb3_said.files.archive import load_tree, save_tree
+from sb3_said.files.archive import load_tree, readable, save_tree
+from sb3_said.files.checks import check_tensors
 from sb3_said.said import SAID
 from sb3_said.said.training import PLANNER_CHECKPOINT_NAME
-from sb3_said.zoo.manager import log_suffix
+from sb3_said.zoo.folder import log_suffix
 
 
 class DepthPlanners:
@@ -82,10 +83,13 @@ class DepthPlanners:
         """
         saved = load_tree(self.path(depth))
         advice = "Tune as before, or into another folder, or delete the file to train anew."
-        check_same(f"{self.path(depth)} was trained", saved["settings"], self.training(depth), advice)
+        with readable(self.path(depth), explained=(ValueError,)):
+            check_same(f"{self.path(depth)} was trained", saved["settings"], self.training(depth), advice)
         policy = self.model.policy
         policy.make_planner(replace(self.config, depth=depth, **sampling))
-        policy.planner.load_state_dict(saved["planner"])
+        with readable(self.path(depth)):
+            check_tensors("planner", saved["planner"], policy.planner.state_dict())
+            policy.planner.load_state_dict(saved["planner"])
         policy.planner_updates.fill_(float(self.gradient_steps))
 
     def _train(self, depth: int) -> None:
@@ -104,13 +108,14 @@ class DepthPlanners:
         if buffer.size() > 0:
             return
         state = load_tree(self.checkpoint)
-        steps = state["counters"]["num_timesteps"]
-        if steps != self.model.num_timesteps:
-            raise ValueError(
-                f"The agent has seen {self.model.num_timesteps} steps, the replay in {self.checkpoint} is of step "
-                f"{steps}; finish the run first: sb3-said train --resume {self.checkpoint.parent}"
-            )
-        buffer.load_state_dict(state["replay_buffer"])
+        with readable(self.checkpoint, explained=(ValueError,)):
+            steps = state["counters"]["num_timesteps"]
+            if steps != self.model.num_timesteps:
+                raise ValueError(
+                    f"the agent has seen {self.model.num_timesteps} steps, the replay is of step {steps}; finish the "
+                    f"run first: sb3-said train --resume {self.checkpoint.parent}"
+                )
+            buffer.load_state_dict(state["replay_buffer"])
 
     def _update_planner(self, depth: int) -> None:
         folder = self.folder / f"planner_depth{depth}"

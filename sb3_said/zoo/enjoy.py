@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import torch as th
 
 from sb3_said.zoo.arguments import TRUST, add_run, check_positive, explained, make_parser, read_delay
 from sb3_said.zoo.runs import ANSWERS, answering, load_run
@@ -17,13 +18,13 @@ from sb3_said.zoo.runs import ANSWERS, answering, load_run
 EPILOG = f"""\
 examples:
   # three episodes in a window
-  sb3-said enjoy logs/said/Hopper-v5-delay4_1 --episodes 3
+  sb3-said enjoy logs/said/Hopper-v5-delay4-seed1_1 --episodes 3
 
   # a video at real speed, on a machine without a display
-  sb3-said enjoy logs/said/Hopper-v5-delay4_1 --record hopper.mp4
+  sb3-said enjoy logs/said/Hopper-v5-delay4-seed1_1 --record hopper.mp4
 
   # the expert from the same starts, as a GIF
-  sb3-said enjoy logs/said/Hopper-v5-delay4_1 --answer expert --record hopper_expert.gif
+  sb3-said enjoy logs/said/Hopper-v5-delay4-seed1_1 --answer expert --record hopper_expert.gif
 
 Videos need the extra sb3_said[video]. Without a display, MuJoCo draws through EGL; MUJOCO_GL=osmesa draws in software.
 {TRUST}
@@ -131,13 +132,15 @@ def main(argv: list[str] | None = None) -> None:
             parser.error("there is no display here to open a window on: give --record FILE.mp4")
         os.environ.setdefault("MUJOCO_GL", "egl")
     with explained(parser):
-        check_positive(args, "episodes", "fps")
+        check_positive(args, "episodes", "fps", "num_threads")
+        th.set_num_threads(args.num_threads)
         video = None
         if args.record is not None:
             check_can_record(args.record)
             video = Video(args.record, args.fps)
         drawn = {"render_mode": "rgb_array" if video else "human"}
-        run = load_run(args.run, args.algo, args.env, read_delay(args.delay), args.device, drawn)
+        played = args.algo, args.env, read_delay(args.delay), args.device, drawn, args.gym_packages
+        run = load_run(args.run, *played)
         with answering(run.model, args.answer), closing(video) if video else nullcontext():
             run.play(
                 args.episodes,

@@ -17,10 +17,10 @@ from sb3_said.zoo.runs import LoadedRun, answering, answers, load_run, origin
 EPILOG = f"""\
 examples:
   # 20 episodes of the planner, and of the expert beside it; writes evaluation.json into the run folder
-  sb3-said evaluate logs/said/Hopper-v5-delay4_1
+  sb3-said evaluate logs/said/Hopper-v5-delay4-seed1_1
 
-  # the checkpoint that did best in training, under a shorter delay, with a plot
-  sb3-said evaluate logs/said/Hopper-v5-delay4_1/best_model.zip --delay 2 --json hopper_d2.json --plot hopper.png
+  # the expert that did best in training, under a shorter delay
+  sb3-said evaluate logs/said/Hopper-v5-delay4-seed1_1/expert/best_model.zip --delay 2 --json d2.json
 
   # an agent that came without its run folder
   sb3-said evaluate hopper.zip --algo said --env Hopper-v5 --delay 4
@@ -39,15 +39,15 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--latency-calls", type=int, default=200, help="decisions to time, 0 for none (default: 200)")
     parser.add_argument("--json", type=Path, help="where to write the numbers (default: RUN/evaluation.json)")
     parser.add_argument("--plot", type=Path, help="draw returns and training curves to this .png or .pdf")
-    parser.add_argument("--num-threads", type=int, help="torch threads (default: torch's own choice)")
     args = parser.parse_args(argv)
-    if args.num_threads is not None:
-        th.set_num_threads(args.num_threads)
     with explained(parser):
-        check_positive(args, "episodes", "n_envs")
+        check_positive(args, "episodes", "n_envs", "num_threads")
+        th.set_num_threads(args.num_threads)
         if args.plot is not None:
             plots.panels()  # without matplotlib, fail now and not after the episodes
-        run = load_run(args.run, args.algo, args.env, read_delay(args.delay), args.device)
+        run = load_run(
+            args.run, args.algo, args.env, read_delay(args.delay), args.device, gym_packages=args.gym_packages
+        )
 
     last_seed = args.seed + args.episodes - 1
     print(f"{run.info['algo']} on {run.info['env']}, delay {run.info['delay']}, reset seeds {args.seed}..{last_seed}")

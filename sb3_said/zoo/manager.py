@@ -3,32 +3,29 @@
 from __future__ import annotations
 
 import argparse
-import functools
-import json
-import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rl_zoo3 import ALGOS
+from filelock import FileLock
+from rl_zoo3 import ALGOS, exp_manager
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
-from rl_zoo3.utils import get_latest_run_id
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import CallbackList
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
 from stable_baselines3.common.logger import Logger, make_output_format
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC, PlannerTrainingCallback
-from sb3_said.delays.text import make_process
-from sb3_said.files.atomic import write_json
+from sb3_said import SAID, DelayedSAC, PlannerTrainingCallback
 from sb3_said.files.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback, restore_training
+from sb3_said.files.normalization import load_normalization, normalization_file, save_normalization
+from sb3_said.zoo.answer import EXPERT_FOLDER, evaluate_answer
 from sb3_said.zoo.arguments import Delay, largest_delay
+from sb3_said.zoo.folder import claim_folder, drop_undone_episodes, hold_folder, log_suffix
 from sb3_said.zoo.presets import config_file, preset_overrides
-
-ARGUMENTS_NAME = "train_args.json"
-WRAPPER = "sb3_said.delays.DelayedObservationWrapper"
+from sb3_said.zoo.record import EVALUATED, Record, make_wrapper, options_of, with_delay
+from sb3_said.zoo.stopping import Stopping, shielded
 
 #: What each name on the command line is: a class and the flags that make it so.
 ALGORITHMS: dict[str, tuple[type[DelayedSAC], dict[str, bool]]] = {
@@ -48,20 +45,20 @@ for _name, (_class, _) in ALGORITHMS.items():
 class Run:
     """What our command line adds to rl_zoo3's.
 
-    :param argv: the command line, so that a resumed run can be set up as it was
     :param delay: what the wrapper is given; None for no wrapper
     :param preset: see ``preset_overrides``
-    :param checkpoint_freq: environment steps between checkpoints
+    :param checkpoint_freq: environment steps between checkpoints; by default time decides
     :param resume: folder of the run to continue
     :param expert_delay: what the expert learns under, ``delay`` by default; the planner serves ``delay`` in any case
+    :param record: of the run to continue
     """
 
-    argv: list[str]
     delay: Delay
     preset: str
-    checkpoint_freq: int
+    checkpoint_freq: int | None = None
     resume: Path | None = None
     expert_delay: Delay = None
+    record: Record | None = None
 
     @property
     def delay_name(self) -> str:
@@ -81,26 +78,56 @@ class DelayedExperimentManager(ExperimentManager):
 
     :param run: what our command line adds
     :param args: rl_zoo3's parsed arguments, then its own parameters
+    :raises ValueError: for a run that another process trains, or that cannot go on
     """
 
     def __init__(self, run: Run, args: argparse.Namespace, algo: str, env_id: str, *zoo_args: Any, **zoo_kwargs: Any):
         zoo_kwargs["config"] = zoo_kwargs.get("config") or str(config_file(algo))
         super().__init__(args, algo, env_id, *zoo_args, **zoo_kwargs)
+        if algo == "said" and self.optimize_hyperparameters:
+            raise ValueError(
+                "-optimize scores the expert alone, and would train a planner in each trial for nothing. Search the "
+                "expert's settings with --algo sadr -optimize, and the planner's with sb3-said tune on a trained run."
+            )
         self.run = run
-        name = f"{self.env_name}{run.delay_name}"
-        run_id = get_latest_run_id(self.log_path, name) + 1
-        new_path = str(Path(self.log_path) / f"{name}_{run_id}") + zoo_kwargs.get("uuid_str", "")
-        self.save_path = new_path if run.resume is None else str(run.resume)
-        self.params_path = f"{self.save_path}/{self.env_name}"
+        self.stopping = Stopping()
+        self.lock: FileLock | None = None
+        self._uuid = zoo_kwargs.get("uuid_str", "")
+        given = self.custom_hyperparams or {}
+        if run.resume is not None and run.record is not None:
+            self.lock = hold_folder(run.resume)
+            self._set_folder(run.resume)
+            run.record.require(*(set(run.record.missing) - {*given}))
+            run.record.check_hyperparams()
+            self.custom_hyperparams = {**run.record.hyperparams, **given}
+            self.env_kwargs = {**run.record.env_kwargs, **self.env_kwargs}
+            self.eval_env_kwargs = {**run.record.eval_env_kwargs, **self.eval_env_kwargs}
+        else:
+            overrides = preset_overrides(self.config, run.preset, env_id, run.delay, run.max_delay)
+            self.custom_hyperparams = {**overrides, **ALGORITHMS[algo][1], **given}
 
-        overrides = preset_overrides(self.config, run.preset, env_id, run.delay, run.max_delay)
-        overrides |= ALGORITHMS[algo][1]
-        if run.delay is not None:
-            largest = {} if run.expert_delay is None else {"max_delay": run.max_delay}
-            overrides["env_wrapper"] = [{WRAPPER: {"delay": run.delay, **largest}}]
-        if run.expert_delay is not None and "env_wrapper" in (self.custom_hyperparams or {}):
-            raise ValueError("--expert-delay sets the wrapper itself; leave env_wrapper out of -params.")
-        self.custom_hyperparams = {**overrides, **(self.custom_hyperparams or {})}
+    def release(self) -> None:
+        """Let other processes train in the run's folder."""
+        if self.lock is not None:
+            self.lock.release()
+
+    def _set_folder(self, folder: Path) -> None:
+        self.save_path, self.params_path = str(folder), f"{folder}/{self.env_name}"
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Read them as rl_zoo3 does, with the delay around the user's own wrappers, and text that is code evaluated."""
+        hyperparams, saved = super().read_hyperparameters()
+        for name in EVALUATED:
+            if isinstance(text := saved.get(name), str):
+                saved[name], hyperparams[name] = (eval(text, vars(exp_manager)) for _ in range(2))
+        self._own_wrappers = saved.pop("env_wrapper", None)
+        wrappers = with_delay(self._own_wrappers, self.run.delay, self.run.expert_delay)
+        if wrappers:
+            saved["env_wrapper"] = hyperparams["env_wrapper"] = wrappers
+            print(f"Wrappers, from the task outwards: {wrappers}")
+        if "DelayedObservationWrapper" not in str(wrappers):
+            print(f"NO DELAY: this trains on {self.env_name.gym_id} without any delay; --delay 4 adds one of 4 steps.")
+        return hyperparams, saved
 
     def create_envs(self, *args: Any, **kwargs: Any) -> VecEnv:
         """Make environments of the expert's delay, in training as in the evaluations beside it.
@@ -108,29 +135,78 @@ class DelayedExperimentManager(ExperimentManager):
         The run's settings on disk keep the delay that the agent is for.
         """
         if self.run.expert_delay is not None:
-            process = make_process(self.run.expert_delay)
-            self.env_wrapper = functools.partial(DelayedObservationWrapper, delay=process, max_delay=self.run.max_delay)
-        return super().create_envs(*args, **kwargs)
+            self.env_wrapper = make_wrapper(with_delay(self._own_wrappers, self.run.expert_delay, self.run.delay))
+        with shielded():
+            return super().create_envs(*args, **kwargs)
+
+    def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
+        """Normalise as rl_zoo3 does, but read what a given agent (-i) learned from a file without pickle."""
+        given = normalization_file(Path(self.trained_agent)) if self.continue_training else None
+        if given is not None and given.exists():
+            env = load_normalization(given, env, training=not eval_env)
+            env.norm_reward = env.norm_reward and not eval_env
+        elif self.normalize:
+            held = {"norm_reward": False, "training": False} if eval_env else {}
+            env = VecNormalize(env, **(self.normalize_kwargs | held))
+        return env
+
+    @property
+    def folder(self) -> Path:
+        """The run's."""
+        return Path(self.save_path)
 
     @property
     def checkpoint(self) -> Path:
         """File that a killed run goes on from."""
-        return Path(self.save_path) / CHECKPOINT_NAME
+        return self.folder / CHECKPOINT_NAME
 
     def create_log_folder(self) -> None:
+        if self.lock is None:
+            name = f"{self.env_name}{self.run.delay_name}-seed{self.seed}"
+            self._set_folder(claim_folder(Path(self.log_path), name, self._uuid))
+            self.lock = hold_folder(self.folder)
         super().create_log_folder()
         self.monitor_kwargs["override_existing"] = not self.checkpoint.exists()
-        drawn = [] if "--seed" in self.run.argv else ["--seed", str(self.seed)]
-        write_json(Path(self.save_path) / ARGUMENTS_NAME, [*self.run.argv, *drawn])
+
+    def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
+        super()._save_config(saved_hyperparams)
+        hyperparams = {**saved_hyperparams, "env_wrapper": self._own_wrappers}
+        hyperparams.pop("env_kwargs", None)
+        Record(
+            self.algo,
+            self.env_name.gym_id,
+            self.seed,
+            self.run.delay,
+            self.run.expert_delay,
+            self.run.preset,
+            self.run.checkpoint_freq,
+            getattr(self.args, "gym_packages", []),
+            self.env_kwargs,
+            self.eval_env_kwargs,
+            hyperparams,
+            options_of(self.args),
+        ).write(self.folder)
 
     def create_callbacks(self) -> None:
         super().create_callbacks()
-        self.callbacks.append(TrainingCheckpointCallback(self.save_path, self.run.checkpoint_freq))
+        self.evaluation = next((c for c in self.callbacks if isinstance(c, EvalCallback)), None)
+        if self.evaluation is not None and self.algo == "said":
+            expert = self.folder / EXPERT_FOLDER
+            self.evaluation.log_path, self.evaluation.best_model_save_path = f"{expert}/evaluations", str(expert)
+        if self.evaluation is not None:
+            self.evaluation.callback_on_new_best = SaveNormalization(
+                normalization_file(Path(str(self.evaluation.best_model_save_path), "best_model.zip")),
+                self.evaluation.callback_on_new_best,
+            )
+        self.checkpointing = TrainingCheckpointCallback(self.folder, self.run.checkpoint_freq, self.stopping)
+        self.callbacks.append(self.checkpointing)
         if self.algo == "said":
-            self.callbacks.append(PlannerTrainingCallback(folder=self.save_path, progress_bar=self.show_progress))
+            self.callbacks.append(
+                PlannerTrainingCallback(folder=self.folder, progress_bar=self.show_progress, should_stop=self.stopping)
+            )
 
     def learn(self, model: BaseAlgorithm) -> None:
-        """Train, from the last checkpoint if there is one; Ctrl-C ends the training and keeps what was learned.
+        """Train, from the last checkpoint if there is one. Ctrl-C, SIGTERM or SIGHUP ends it with a checkpoint.
 
         :param model: newly made
         """
@@ -138,73 +214,74 @@ class DelayedExperimentManager(ExperimentManager):
         if resumes:
             restore_training(model, self.checkpoint, CallbackList(self.callbacks))  # type: ignore[arg-type]
             print(f"Resuming {self.save_path} at step {model.num_timesteps}")
-            drop_undone_episodes(Path(self.save_path), model.num_timesteps // model.n_envs)
+            drop_undone_episodes(self.folder, model.num_timesteps // model.n_envs)
         taken = model.num_timesteps if resumes else 0  # learn() counts the steps of an agent given with -i anew
         model.set_logger(self._logger(taken))
         # rl_zoo3: -1 is the default, anything below logs nothing by itself
         log_interval = {-1: 4}.get(self.log_interval, self.log_interval if self.log_interval > 0 else None)
         try:
-            model.learn(
-                max(self.n_timesteps - taken, 0),
-                callback=self.callbacks,
-                log_interval=log_interval,  # type: ignore[arg-type]  # SB3 takes None and says so in its docstring
-                reset_num_timesteps=not resumes,
-            )
+            with self.stopping.listening():
+                model.learn(
+                    max(self.n_timesteps - taken, 0),
+                    callback=self.callbacks,
+                    log_interval=log_interval,  # type: ignore[arg-type]  # SB3 takes None and says so in its docstring
+                    reset_num_timesteps=not resumes,
+                )
+                if self.stopping.is_asked:
+                    raise KeyboardInterrupt
+                if isinstance(model, SAID) and model.policy.planner_is_trained and self.evaluation is not None:
+                    evaluate_answer(model, self.evaluation, self.folder, self.stopping)
         except KeyboardInterrupt:
-            print(f"Interrupted at step {model.num_timesteps}; go on with --resume {self.save_path}")
+            self.stopping.is_asked = True
+            written = not self.stopping.is_forced and self.checkpointing.save()
+            state = "and wrote a checkpoint" if written else "without a checkpoint of this step"
+            print(f"Interrupted at step {model.num_timesteps} {state}; go on with --resume {self.save_path}")
+        except Exception:
+            print(f"Stopped at step {model.num_timesteps} by an error; --resume {self.save_path} goes on from the "
+                  "last checkpoint, or begins again where there is none.")  # fmt: skip
+            raise
         finally:
             if model.env is not None:
                 model.env.close()
+
+    def save_trained_model(self, model: BaseAlgorithm) -> None:
+        super().save_trained_model(model)
+        vec_normalize = model.get_vec_normalize_env()
+        if vec_normalize is not None:
+            save_normalization(normalization_file(self.folder / f"{self.env_name}.zip"), vec_normalize)
 
     def _logger(self, steps: int) -> Logger:
         """Log to the screen, to progress.csv (one file per resume) and to TensorBoard if asked for.
 
         :param steps: environment steps the run has taken
         """
-        formats = [make_output_format("csv", self.save_path, log_suffix(Path(self.save_path), steps))]
+        formats = [make_output_format("csv", self.save_path, log_suffix(self.folder, steps))]
         if self.verbose > 0:
             formats.append(make_output_format("stdout", self.save_path))
         if self.tensorboard_log is not None:
-            formats.append(make_output_format("tensorboard", f"{self.tensorboard_log}/{Path(self.save_path).name}"))
+            board = Path(self.tensorboard_log, self.algo, self.folder.name)
+            formats.append(make_output_format("tensorboard", str(board)))
         return Logger(self.save_path, formats)
 
 
-def log_suffix(folder: Path, steps: int) -> str:
-    """Return a suffix of ``progress.csv`` that no log has yet.
+class SaveNormalization(BaseCallback):
+    """Write what VecNormalize has learned, beside the agent that reads it.
 
-    :param folder: of the run
-    :param steps: environment steps that the run has taken
+    :param path: of the file
+    :param before: rl_zoo3's own callback of the same purpose, for its own tools
     """
-    names = ["" if steps == 0 else f"_{steps}", *(f"_{steps}_{k}" for k in range(2, 1000))]
-    return next(name for name in names if not (folder / f"progress{name}.csv").exists())
 
+    def __init__(self, path: Path, before: BaseCallback | None):
+        super().__init__()
+        self.path, self.before = path, before
 
-def drop_undone_episodes(run_dir: Path, steps: int) -> None:
-    """Cut from SB3's monitor files the episodes that a resume undoes: those that ended after the checkpoint.
+    def _init_callback(self) -> None:
+        if self.before is not None:
+            self.before.init_callback(self.model)
 
-    The episode during which the checkpoint was written is missing from the files.
-
-    :param steps: environment steps up to the checkpoint, of each environment
-    """
-    for file in run_dir.glob("*.monitor.csv"):
-        lines = file.read_bytes().splitlines(keepends=True)
-        size, taken = len(b"".join(lines[:2])), 0  # a comment and the header: r,l,t
-        for line in lines[2:]:
-            taken += int(line.split(b",")[1]) if line.endswith(b"\n") else steps + 1  # unfinished: undone, too
-            if taken > steps:
-                break
-            size += len(line)
-        os.truncate(file, size)  # in place: the environments have opened it, to append to it
-
-
-def read_arguments(run_dir: Path) -> list[str]:
-    """Return the command line that a run was started with.
-
-    :raises ValueError: when the folder holds no run
-    """
-    path = run_dir / ARGUMENTS_NAME
-    if not path.exists():
-        raise ValueError(
-            f"{run_dir} holds no run: {path} is missing. Give the folder that the training printed as 'Log path'."
-        )
-    return list(json.loads(path.read_text()))
+    def _on_step(self) -> bool:
+        if self.before is not None:
+            self.before.on_step()
+        if (vec_normalize := self.model.get_vec_normalize_env()) is not None:
+            save_normalization(self.path, vec_normalize)
+        return True

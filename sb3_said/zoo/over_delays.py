@@ -27,16 +27,17 @@ from sb3_said.zoo.runs import ANSWERS, LoadedRun, answering, answers, delay_name
 EPILOG = f"""\
 examples:
   # an agent trained for all delays beside one trained for a single delay: a table, the numbers, a plot
-  sb3-said over-delays any=logs/said/Hopper-v5-delay0-16_1 d8=logs/sadr/Hopper-v5-delay8_1 --workers 2 \\
+  sb3-said over-delays any=logs/said/Hopper-v5-delay0-16-seed1_1 d8=logs/sadr/Hopper-v5-delay8-seed1_1 --workers 2 \\
       --delays 0 2 4 8 12 16 "UniformDelay(0, 8)" WIFI_20MS --json hopper.json --plot hopper.png
 
   # training seeds of one setting share a label: they are one row, with intervals over the seeds
-  sb3-said over-delays d4=logs/said/Hopper-v5-delay4_1 d4=logs/said/Hopper-v5-delay4_2 \\
-      d4=logs/said/Hopper-v5-delay4_3 --delays 0 2 4 --json seeds.json
+  sb3-said over-delays d4=logs/said/Hopper-v5-delay4-seed1_1 d4=logs/said/Hopper-v5-delay4-seed2_1 \\
+      d4=logs/said/Hopper-v5-delay4-seed3_1 --delays 0 2 4 --json seeds.json
 
   # runs of several delays that share a label are one row, too: each plays the delay that it was trained under
-  sb3-said over-delays any=logs/said/Hopper-v5-delay0-16_1 each=logs/said/Hopper-v5-delay0_1 \\
-      each=logs/said/Hopper-v5-delay4_1 each=logs/said/Hopper-v5-delay16_1 --delays 0 4 16 --json hopper.json
+  sb3-said over-delays any=logs/said/Hopper-v5-delay0-16-seed1_1 each=logs/said/Hopper-v5-delay0-seed1_1 \\
+      each=logs/said/Hopper-v5-delay4-seed1_1 each=logs/said/Hopper-v5-delay16-seed1_1 --delays 0 4 16 \\
+      --json hopper.json
 
   # some rows and delays again, under names for readers; without runs nothing is played
   sb3-said over-delays --json hopper.json --rows "any planner=one agent" "each planner=an agent for each delay" \\
@@ -66,7 +67,6 @@ def main(argv: list[str] | None = None) -> None:
     add_playing(parser, episodes=20)
     parser.add_argument("--n-envs", type=int, default=8, help="episodes played side by side (default: 8)")
     parser.add_argument("--workers", type=int, default=1, help="cells played at once, in processes (default: 1)")
-    parser.add_argument("--num-threads", type=int, default=1, help="torch threads of each worker (default: 1)")
     args = parser.parse_args(argv)
     with explained(parser):
         check_positive(args, "episodes", "n_envs", "workers", "num_threads")
@@ -179,7 +179,7 @@ def open_runs(args: argparse.Namespace) -> dict[str, list[LoadedRun]]:
         given, path = re.fullmatch(r"(?:([^=/]+)=)?(.*)", text, re.DOTALL).groups()  # type: ignore[union-attr]  # fits all
         label = given or "/".join(Path(path).absolute().parts[-2:]).removesuffix(".zip")
         with at_any_age():
-            run = load_run(path, args.algo, args.env, None, args.device)
+            run = load_run(path, args.algo, args.env, None, args.device, gym_packages=args.gym_packages)
         row = runs.setdefault(label, [])
         if any(digest_of(run) == digest_of(other) for other in row):
             raise ValueError(
@@ -249,7 +249,7 @@ def obstacle(model: Any, answer: str | None, delay: int | str) -> str | None:
 
 def play_all(cells: list[Cell], env_id: str, args: argparse.Namespace) -> Iterator[tuple[Cell, Summary]]:
     """Play cells, in processes if more than one are to be played at once; yields them as they are done."""
-    how = (env_id, args.episodes, args.seed, args.n_envs, args.device)
+    how = (env_id, args.episodes, args.seed, args.n_envs, args.device, args.gym_packages)
     if args.workers == 1:
         yield from ((cell, play(cell, *how)) for cell in cells)
         return
@@ -262,10 +262,12 @@ def play_all(cells: list[Cell], env_id: str, args: argparse.Namespace) -> Iterat
         pool.shutdown(cancel_futures=True)
 
 
-def play(cell: Cell, env_id: str, episodes: int, seed: int, n_envs: int, device: str) -> Summary:
+def play(
+    cell: Cell, env_id: str, episodes: int, seed: int, n_envs: int, device: str, gym_packages: list[str]
+) -> Summary:
     """Play the episodes of a cell."""
     with at_any_age():
-        run = load_run(cell.file, cell.algo, env_id, cell.delay, device)
+        run = load_run(cell.file, cell.algo, env_id, cell.delay, device, gym_packages=gym_packages)
         with answering(run.model, cell.answer):
             played = run.play(episodes, seed, n_envs)
     return Summary.from_episodes(cell.agent, played.returns, played.lengths)

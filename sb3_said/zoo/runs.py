@@ -6,7 +6,7 @@ import os
 import platform
 import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -16,19 +16,20 @@ from typing import Any, get_args
 
 import gymnasium as gym
 import torch as th
-import yaml
 from gymnasium import spaces
-from rl_zoo3.utils import get_saved_hyperparams, get_wrapper_class
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_said import DelayedSAC, __version__
 from sb3_said.delays import DelayProcess, FixedDelay
 from sb3_said.delays.space import ages_of, has_state_history
 from sb3_said.evaluation.rollout import Observation, Rollout, rollout
+from sb3_said.files.normalization import load_normalization, normalization_file
 from sb3_said.said.policies import Answer
+from sb3_said.zoo.answer import EXPERT_FOLDER
 from sb3_said.zoo.arguments import Delay, largest_delay
-from sb3_said.zoo.manager import ALGOS, WRAPPER
+from sb3_said.zoo.manager import ALGOS
+from sb3_said.zoo.record import RECORD_NAME, WRAPPER, Record, import_packages, make_wrapper
 
 ANSWERS = get_args(Answer)
 
@@ -59,25 +60,27 @@ def load_run(
     delay: Delay = None,
     device: str = "auto",
     env_kwargs: dict[str, Any] | None = None,
+    gym_packages: Sequence[str] = (),
 ) -> LoadedRun:
     """Open a run.
 
-    A run folder's YAML is read the way rl_zoo3 reads it, which can run code: open only folders that you trust. A
-    ``.zip`` on its own, outside a run folder, is opened by its algorithm's ``load`` alone.
+    Nothing in its files is run. What makes the task is: the installed modules that ``run.json`` names are imported.
 
-    :param path: a run folder such as ``logs/said/Hopper-v5-delay4_1``, or an agent's ``.zip``
+    :param path: a run folder such as ``logs/said/Hopper-v5-delay4-seed1_1``, or an agent's ``.zip``
     :param algo: name of the algorithm; read from the run folder where there is one
     :param env_id: task to play; the one of the run folder by default
     :param delay: observation delay to play under; the trained one by default, and outside a run folder the largest that
         the agent was built for
     :param device: torch device
     :param env_kwargs: more arguments for ``gymnasium.make``, such as ``render_mode``
+    :param gym_packages: modules that register the task, beside those that the run remembers
+    :raises ImportError: for a module that is not there
     :raises ValueError: when the files do not say what to load, or the agent does not fit the task
     """
-    file, params = find_agent(Path(path))
-    hyperparams, args = read_params(params)
-    algo = algo or args.get("algo")
-    env_id = env_id or args.get("env")
+    file, record = find_agent(Path(path))
+    hyperparams = record.hyperparams if record is not None else {}
+    algo = algo or (record.algo if record is not None else None)
+    env_id = env_id or (record.env if record is not None else None)
     if algo not in ALGOS:
         raise ValueError(f"The algorithm of {file} is not known ({algo}): give --algo, one of {', '.join(ALGOS)}.")
     if env_id is None:
@@ -86,13 +89,16 @@ def load_run(
         if hyperparams.get(key):
             raise ValueError(f"{file} was trained with {key}={hyperparams[key]}, which cannot be played here.")
 
+    if record is not None:
+        record.require("env_wrapper", "env_kwargs")
+    import_packages([*(record.gym_packages if record is not None else ()), *gym_packages])
+
     model = ALGOS[algo].load(file, device=device)
-    wrappers = hyperparams.get("env_wrapper") or []
-    wrappers = list(wrappers) if isinstance(wrappers, list) else [wrappers]
-    if delay is not None or params is None:
+    wrappers = record.wrappers if record is not None else []
+    if delay is not None or record is None:
         wrappers = _with_delay(wrappers, delay, model)
-    wrap = get_wrapper_class({"env_wrapper": wrappers}) if wrappers else None
-    kwargs = {**hyperparams.get("env_kwargs", {}), **(args.get("env_kwargs") or {}), **(env_kwargs or {})}
+    wrap = make_wrapper(wrappers)
+    kwargs = {**(record.env_kwargs if record is not None else {}), **(env_kwargs or {})}
 
     def make_env() -> gym.Env[Any, Any]:
         env: gym.Env[Any, Any] = gym.make(env_id, **kwargs)
@@ -106,28 +112,31 @@ def load_run(
     env.close()
     info = {"algo": algo, "env": env_id, "delay": delay_name(delay_process)}
     info |= {"file": str(file), "trained_steps": model.num_timesteps}
-    return LoadedRun(model, make_env, _load_normalize(params, hyperparams, make_env), file.parent, info)
+    return LoadedRun(model, make_env, _load_normalize(file, record, make_env), file.parent, info)
 
 
-def find_agent(path: Path) -> tuple[Path, Path | None]:
-    """Return the agent's file, and the folder of its run's YAML if it lies in a run folder.
+def find_agent(path: Path) -> tuple[Path, Record | None]:
+    """Return the agent's file, and the record of its run if it lies in a run folder.
 
     :param path: a run folder, or an agent's ``.zip``
     :raises ValueError: for a path without an agent
     """
     if not path.exists():
-        raise ValueError(f"{path} does not exist; give a run folder such as logs/said/Hopper-v5-delay4_1 or a .zip.")
-    params = [file.parent for file in (path if path.is_dir() else path.parent).glob("*/args.yml")]
+        raise ValueError(
+            f"{path} does not exist; give a run folder such as logs/said/Hopper-v5-delay4-seed1_1 or a .zip."
+        )
     if path.is_file():
-        return path, params[0] if len(params) == 1 else None
-    if len(params) != 1:
-        runs = sorted(str(p.parents[1]) for p in path.glob("**/args.yml"))
-        hint = f"it holds the runs {', '.join(runs)}" if runs else "rl_zoo3 makes one with every training"
-        raise ValueError(f"{path} is not a run folder with one */args.yml: {hint}.")
-    names = f"{params[0].name}.zip", "best_model.zip"
+        folder = path.absolute().parent
+        folder = folder.parent if folder.name == EXPERT_FOLDER else folder
+        return path, Record.read(folder) if (folder / RECORD_NAME).is_file() else None
+    runs = sorted(str(record.parent) for record in path.glob(f"**/{RECORD_NAME}"))
+    if runs and str(path) not in runs:
+        raise ValueError(f"{path} is not a run folder: it holds the runs {', '.join(runs)}.")
+    record = Record.read(path)
+    names = record.agent_name, "best_model.zip"
     for name in names:
         if (path / name).is_file():
-            return path / name, params[0]
+            return path / name, record
     raise ValueError(f"{path} has no finished agent: neither {names[0]} nor {names[1]}.")
 
 
@@ -178,20 +187,6 @@ def origin(run: LoadedRun) -> dict[str, Any]:
     }
 
 
-def read_params(params: Path | None) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return a run's hyper-parameters and command-line arguments from the folder of its YAML; empty without one.
-
-    The YAML can run code: read only that of runs that you trust.
-    """
-    if params is None:
-        return {}, {}
-    hyperparams, _ = get_saved_hyperparams(str(params), test_mode=True)
-    # rl_zoo3 writes Python objects into this file, so that no safe loader reads it.
-    args = dict(yaml.load((params / "args.yml").read_text(), Loader=yaml.UnsafeLoader))
-    args["env"] = getattr(args.get("env"), "gym_id", args.get("env"))
-    return dict(hyperparams), args
-
-
 def _with_delay(wrappers: list[Any], delay: Delay, model: BaseAlgorithm) -> list[Any]:
     """Set the delay to play under, keeping the length of the action history that the model reads."""
     max_delay = longest_delay(model)
@@ -222,11 +217,16 @@ def _check_spaces(model: BaseAlgorithm, env: gym.Env[Any, Any], file: Path) -> N
 
 
 def _load_normalize(
-    params: Path | None, hyperparams: dict[str, Any], make_env: Callable[[], gym.Env[Any, Any]]
+    file: Path, record: Record | None, make_env: Callable[[], gym.Env[Any, Any]]
 ) -> Callable[[Observation], Observation] | None:
-    if params is None or not hyperparams.get("normalize"):
+    beside = [normalization_file(file)]
+    if record is not None:  # rl_zoo3's checkpoints (--save-freq) have none of their own
+        beside.append(normalization_file(file.with_name(record.agent_name)))
+    found = next((path for path in beside if path.is_file()), None)
+    if found is None:
+        if record is not None and record.hyperparams.get("normalize"):
+            raise ValueError(f"{file} reads normalised observations, but {beside[0]} is missing.")
         return None
-    statistics = VecNormalize.load(str(params / "vecnormalize.pkl"), DummyVecEnv([make_env]))
+    statistics = load_normalization(found, DummyVecEnv([make_env]))
     statistics.close()
-    statistics.training = False
     return statistics.normalize_obs

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import secrets
 import sys
 from pathlib import Path
 from typing import Any
@@ -10,28 +11,31 @@ from typing import Any
 import rl_zoo3.train
 
 from sb3_said.zoo.arguments import add_delay, explained, make_parser, read_delay
-from sb3_said.zoo.manager import ALGORITHMS, DelayedExperimentManager, Run, read_arguments
+from sb3_said.zoo.manager import ALGORITHMS, ALGOS, DelayedExperimentManager, Run
 from sb3_said.zoo.presets import PRESETS
+from sb3_said.zoo.record import Record
 
 EXAMPLES = """
 examples:
-  sb3-said train --algo said --env Hopper-v5 --delay 4
+  sb3-said train --algo said --env Hopper-v5 --delay 4 --seed 1
   sb3-said train --algo said --env Ant-v5 --delay 8 --preset paper --seed 1
   sb3-said train --algo sadr --env HalfCheetah-v5 --delay 0 8 -n 300000 -P
   sb3-said train --algo said --env Hopper-v5 --delay "DroppedPackets(UniformDelay(0, 8), p=0.1)"
   sb3-said train --algo said --env Hopper-v5 --delay 0 16 --expert-delay 0
-  sb3-said train --resume logs/said/Hopper-v5-delay4_1
+  sb3-said train --resume logs/said/Hopper-v5-delay4-seed1_1
 
-Runs go to LOG_FOLDER/ALGO/ENV-delayN_K (-f sets LOG_FOLDER); sb3-said evaluate and sb3-said enjoy take that folder.
+Runs go to LOG_FOLDER/ALGO/ENV-delayN-seedS_K (-f sets LOG_FOLDER); sb3-said evaluate and sb3-said enjoy take that
+folder. Ctrl-C, SIGTERM and SIGHUP write a checkpoint before they end the training; --resume goes on from there.
 Below: the options of rl_zoo3, all of which work here.
 """
 
 
 def own_parser() -> argparse.ArgumentParser:
-    """Return the parser of the options that rl_zoo3 does not have."""
+    """Return the parser of the options that rl_zoo3 does not have, or that mean more here."""
     parser = make_parser(__doc__, EXAMPLES, add_help=False)
     parser.add_argument("-h", "--help", action="store_true", help="show this help, then that of rl_zoo3")
-    parser.add_argument("--algo", choices=list(ALGORITHMS), default="said", help="default: said")
+    parser.add_argument("--algo", choices=list(ALGORITHMS), help="default: said")
+    parser.add_argument("--env", help="task, of continuous actions (default: Pendulum-v1)")
     add_delay(parser, default="no delay")
     add_delay(
         parser, "that of --delay", "--expert-delay", "delay that SAID's expert learns under; the planner serves --delay"
@@ -39,52 +43,70 @@ def own_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--preset",
         choices=PRESETS,
-        default="cpu",
         help="cpu: hours on two cores; paper: the paper's table, 5 M steps and 1 M updates, with a planner for every "
         "delay where --delay varies; quick, smoke: minutes (default: cpu)",
     )
+    parser.add_argument("--seed", type=int, help="of everything drawn; part of the folder's name (default: drawn)")
     parser.add_argument(
-        "--checkpoint-freq", type=int, default=25_000, metavar="N", help="steps between checkpoints (default: 25000)"
-    )
+        "--checkpoint-freq", type=int, metavar="N", help="steps between checkpoints (default: by time, every ten "
+        "minutes, and less often the larger the replay is)",
+    )  # fmt: skip
     parser.add_argument("--resume", type=Path, metavar="RUN_DIR", help="go on with a run from its last checkpoint")
     return parser
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Train as the command line says."""
+    """Train as the command line says; exit with 130 when a signal has ended it."""
     parser = own_parser()
     with explained(parser):
         run, algo, zoo_argv = read_command_line(sys.argv[1:] if argv is None else argv)
     if "--help" in zoo_argv:
         parser.print_help()
+    made: list[DelayedExperimentManager] = []
 
     def make_manager(*args: Any, **kwargs: Any) -> DelayedExperimentManager:
         with explained(parser):
-            manager = DelayedExperimentManager(run, *args, **kwargs)
-        return manager
+            made.append(DelayedExperimentManager(run, *args, **kwargs))
+        return made[0]
 
     rl_zoo3.train.ExperimentManager = make_manager  # type: ignore[misc,assignment]
+    rl_zoo3.train.ALGOS = {name: ALGOS[name] for name in ALGORITHMS}  # what its help lists
     sys.argv = [sys.argv[0], "--algo", algo, *zoo_argv]
-    rl_zoo3.train.train()
+    try:
+        rl_zoo3.train.train()
+    finally:
+        for manager in made:
+            manager.release()
+    if made and made[0].stopping.is_asked:
+        sys.exit(130)
 
 
 def read_command_line(argv: list[str]) -> tuple[Run, str, list[str]]:
     """Return what the command line adds to rl_zoo3's, the algorithm, and what is left for rl_zoo3.
 
     :param argv: with ``--resume``, what changes in the command line that the run was started with
-    :raises ValueError: for a folder without a run, a bad delay, or an expert's delay without a planner
+    :raises ValueError: for a folder without a run, a bad delay, an expert's delay without a planner, or a resume of
+        another task
     """
-    resuming = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    resuming.add_argument("--resume", type=Path)
-    given, argv = resuming.parse_known_args(argv)
-    if given.resume is not None:
-        argv = [*read_arguments(given.resume), *argv]
     options, zoo_argv = own_parser().parse_known_args(argv)
+    zoo_argv = [*joined_settings(zoo_argv), *(["--help"] if options.help else [])]
     delay, expert_delay = read_delay(options.delay), read_delay(options.expert_delay)
-    if expert_delay is not None and (options.algo != "said" or delay is None):
+    if options.resume is not None:
+        record = Record.read(options.resume)
+        fixed = {"--algo": options.algo, "--delay": delay, "--expert-delay": expert_delay, "--preset": options.preset}
+        fixed |= {"--seed": options.seed, "--env": options.env}
+        if given := [name for name, value in fixed.items() if value is not None]:
+            raise ValueError(f"--resume goes on with the run's own {', '.join(given)}: leave them out.")
+        freq = record.checkpoint_freq if options.checkpoint_freq is None else options.checkpoint_freq
+        run = Run(record.delay, record.preset, freq, options.resume, record.expert_delay, record)
+        return run, record.algo, [*record.command_line(), *zoo_argv]
+    algo = options.algo or "said"
+    if expert_delay is not None and (algo != "said" or delay is None):
         raise ValueError("--expert-delay needs --algo said and a --delay: an agent without a planner is its expert.")
-    run = Run(argv, delay, options.preset, options.checkpoint_freq, given.resume, expert_delay)
-    return run, options.algo, [*joined_settings(zoo_argv), *(["--help"] if options.help else [])]
+    # Four digits: they are in the folder's name. Evaluation and tuning take reset seeds from 10,000 on.
+    seed = secrets.randbelow(10_000) if options.seed is None or options.seed < 0 else options.seed
+    run = Run(delay, options.preset or "cpu", options.checkpoint_freq, None, expert_delay)
+    return run, algo, [f"--env={options.env or 'Pendulum-v1'}", f"--seed={seed}", *zoo_argv]
 
 
 def joined_settings(argv: list[str]) -> list[str]:

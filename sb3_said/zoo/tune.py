@@ -30,25 +30,25 @@ from sb3_said.zoo.search import DRAWN, describe, find_winner, finished, open_stu
 EPILOG = f"""\
 examples:
   # the paper's grid: three planners are trained, each is tried at six temperatures
-  sb3-said tune --run logs/said/Hopper-v5-delay4_1
+  sb3-said tune --run logs/said/Hopper-v5-delay4-seed1_1
 
   # two workers; they may run on machines that share the folder
-  sb3-said tune --run logs/said/Hopper-v5-delay4_1 --num-threads 1 & \\
-  sb3-said tune --run logs/said/Hopper-v5-delay4_1 --num-threads 1
+  sb3-said tune --run logs/said/Hopper-v5-delay4-seed1_1 --num-threads 1 & \\
+  sb3-said tune --run logs/said/Hopper-v5-delay4-seed1_1 --num-threads 1
 
   # a quick look: one depth, fewer updates, fewer episodes, in a folder of its own
-  sb3-said tune --run logs/said/Hopper-v5-delay4_1 --depths 2 --gradient-steps 5000 --episodes 10 --output look
+  sb3-said tune --run logs/said/Hopper-v5-delay4-seed1_1 --depths 2 --gradient-steps 5000 --episodes 10 --output look
 
   # how the critics choose: the larger the factor, the more the best candidate decides; 100 hardly asks another
-  sb3-said tune --run logs/said/Hopper-v5-delay4_1 --depths 2 --temperatures 0.5 1 --choice-factors 0.3 1 3 100
+  sb3-said tune --run logs/said/Hopper-v5-delay4-seed1_1 --depths 2 --temperatures 0.5 1 --choice-factors 0.3 1 3 100
 
   # any temperature from 0 to 1, fewer denoising steps, in a data base
-  sb3-said tune --run logs/said/Hopper-v5-delay4_1 --sampler tpe --n-trials 30 --sampling-steps 1 2 5 \\
+  sb3-said tune --run logs/said/Hopper-v5-delay4-seed1_1 --sampler tpe --n-trials 30 --sampling-steps 1 2 5 \\
       --storage sqlite:///tune.db
 
   # then train with the winner, or play it
-  sb3-said train --algo said --env Hopper-v5 --delay 4 -conf logs/said/Hopper-v5-delay4_1/tune/best.yml
-  sb3-said evaluate logs/said/Hopper-v5-delay4_1/tune/best.zip
+  sb3-said train --algo said --env Hopper-v5 --delay 4 -conf logs/said/Hopper-v5-delay4-seed1_1/tune/best.yml
+  sb3-said evaluate logs/said/Hopper-v5-delay4-seed1_1/tune/best.zip
 
 The search keeps the run's expert and replay, and trains one planner per depth. Every trial plays the same episodes. A
 trial that is clearly worse than the best, episode by episode, is pruned. The best of many trials looks better on these

@@ -1,18 +1,32 @@
 """Which spaces are served, what is read off them, and why others are refused."""
 
 import itertools
+from functools import partial
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from counting_task import OBS_DIM, CountingTask
 from gymnasium import spaces
-from gymnasium.wrappers import FlattenObservation, TransformAction
+from gymnasium.wrappers import ClipAction, FlattenObservation, FrameStackObservation, TransformAction
 from small_task import Drift, LateDelay, OwnDelay, delayed
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_said.delays import DelayedObservationWrapper, TotalDelay, scale_action, unscale_action
-from sb3_said.delays.space import ages_of, check_spaces, has_state_history, written_ages
+from sb3_said.delays.space import (
+    ages_of,
+    check_one_max_delay,
+    check_spaces,
+    delayed_space,
+    has_state_history,
+    written_ages,
+)
+
+
+def with_parts(**parts):
+    """The space of a delayed task, of 3 numbers and 2 actions, with other parts."""
+    return spaces.Dict({**delayed_space(spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (2,)), 5).spaces, **parts})
 
 
 @pytest.mark.parametrize(
@@ -23,9 +37,15 @@ from sb3_said.delays.space import ages_of, check_spaces, has_state_history, writ
         (spaces.Dict(observation=spaces.Box(-1, 1, (3,))), spaces.Box(-1, 1, (2,)), "wrap the task"),
         (spaces.Box(-1, 1, (3,)), spaces.Box(-1, -1, (2,)), "low and high are equal"),
         (spaces.Sequence(spaces.Discrete(3)), spaces.Box(-1, 1, (2,)), "of a fixed length"),
-        (spaces.Box(-1, 1, (3,)), spaces.Discrete(2), "finite bounds.*are not supported"),
-        (spaces.Box(-1, 1, (3,)), spaces.Box(-1, np.inf, (2,)), "finite bounds.*TransformAction"),
-        (spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (2, 2)), "finite bounds.*TransformAction"),
+        (spaces.Box(-1, 1, (3,)), spaces.Discrete(2), "discrete actions is not supported"),
+        (spaces.Box(-1, 1, (3,)), spaces.MultiDiscrete([2, 2]), "discrete actions is not supported"),
+        (spaces.Box(-1, 1, (3,)), spaces.Box(-1, np.inf, (2,)), "must be finite.*TransformAction"),
+        (spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (2, 2)), r"1-D Box action.*action\.reshape"),
+        (spaces.Box(-1, 1, (0,)), spaces.Box(-1, 1, (2,)), "The observation has no entries"),
+        (spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (0,)), "The action has no entries"),
+        (with_parts(action_history=spaces.Box(-1, 1, (5, 1))), spaces.Box(-1, 1, (2,)), r"gives the shape \(5, 2\)"),
+        (with_parts(action_history=spaces.Box(-1, 1, (10**9, 0))), spaces.Box(-1, 1, (2,)), "gives the shape"),
+        (with_parts(delay=spaces.Box(0, 5, (2,))), spaces.Box(-1, 1, (2,)), r"delay was changed to .*\(2,\)"),
     ],
 )
 def test_other_spaces_are_refused_with_a_reason(observation_space, action_space, reason):
@@ -46,17 +66,6 @@ def test_an_observation_is_served_once_it_is_flattened(space):
     assert env.observation_space.contains(obs) and env.observation_space.contains(
         env.step(env.action_space.sample())[0]
     )
-
-
-@pytest.mark.parametrize("space", [spaces.Box(-np.inf, np.inf, (2,)), spaces.Box(-1, 1, (1, 2))], ids=str)
-def test_an_action_is_served_once_it_is_transformed(space):
-    task = CountingTask(itertools.count(), max_length=3)
-    task.action_space = space
-    flat = TransformAction(task, lambda action: action.reshape(space.shape), spaces.Box(-1, 1, (2,)))
-    env = DelayedObservationWrapper(flat, 1)
-    env.reset(seed=0)
-    action = env.action_space.sample()
-    np.testing.assert_array_equal(env.step(action)[0]["action_history"], [action])
 
 
 BOUNDS = [
@@ -90,6 +99,82 @@ def test_actions_are_scaled_as_by_sb3(low, high, dtype):
     np.testing.assert_allclose(scale_action(actions, space), policy.scale_action(actions), atol=1e-5)
     scaled = scale_action(actions, space)
     np.testing.assert_allclose(unscale_action(scaled, space), policy.unscale_action(scaled), rtol=1e-6, atol=1e-6)
+
+
+class Boundless(Drift):
+    action_space = spaces.Box(-np.inf, np.inf, (1,), np.float32)
+
+
+class Matrix(Drift):
+    action_space = spaces.Box(-2.0, 2.0, (1, 1), np.float32)
+
+    def step(self, action):
+        assert action.shape == (1, 1)
+        return super().step(action[0])
+
+
+@pytest.mark.parametrize(
+    ("task", "wrap"),
+    [
+        (Boundless, lambda task: TransformAction(task, lambda action: action, spaces.Box(-2.0, 2.0, (1,)))),
+        (Matrix, lambda task: TransformAction(task, lambda action: action.reshape(1, 1), spaces.Box(-2.0, 2.0, (1,)))),
+    ],
+)
+def test_what_is_advised_where_actions_do_not_fit_helps(task, wrap):
+    with pytest.raises(ValueError, match=r"gymnasium\.wrappers\.TransformAction"):
+        DelayedObservationWrapper(task())
+    with pytest.raises(ValueError, match="bounds"):
+        DelayedObservationWrapper(ClipAction(Boundless()))
+    env, expected = DelayedObservationWrapper(wrap(task()), 1), delayed(1)
+    for each in (env, expected):
+        each.reset(seed=0)
+    answers = [each.step(np.array([0.5], np.float32))[0] for each in (env, expected)]
+    np.testing.assert_equal(*answers)
+
+
+def stacked(**kwargs):
+    return VecFrameStack(DummyVecEnv([lambda: delayed(**kwargs)]), 3)
+
+
+class Renamed(gym.ObservationWrapper):
+    """Adds an entry of its own."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.observation_space = spaces.Dict({**env.observation_space.spaces, "battery": spaces.Box(0, 1, (1,))})
+
+    def observation(self, observation):
+        return {**observation, "battery": np.ones(1, np.float32)}
+
+
+@pytest.mark.parametrize(
+    ("env", "changed"),
+    [
+        (stacked(), r"action_history was changed to Box\(-1.0, 1.0, \(2, 3\)"),
+        (stacked(delay=0), r"action_history was changed to .*\(0, 3\)"),
+        (Renamed(delayed()), "got the keys .*battery"),
+    ],
+)
+def test_wrappers_around_ours_are_told_their_place(env, changed):
+    with pytest.raises(ValueError, match=f"{changed}.* go below DelayedObservationWrapper"):
+        check_spaces(env.observation_space, env.action_space)
+
+
+def test_what_is_advised_instead_of_a_stack_of_frames_helps():
+    env = DelayedObservationWrapper(FlattenObservation(FrameStackObservation(Drift(), 3)), 2)
+    assert check_spaces(env.observation_space, env.action_space)[0].shape == (6,)
+    normalized = VecNormalize(DummyVecEnv([delayed]), norm_obs_keys=["observation"])
+    assert check_spaces(normalized.observation_space, normalized.action_space)[1] == 2
+
+
+def test_environments_of_one_batch_have_one_max_delay():
+    def vec(*max_delays):
+        return DummyVecEnv([partial(delayed, 1, max_delay=max_delay) for max_delay in max_delays])
+
+    with pytest.raises(ValueError, match=r"\[2, 4, 2\]; give each of them .*max_delay=4\)"):
+        check_one_max_delay(vec(2, 4, 2))
+    for env in (vec(3, 3), delayed(2), Drift(), DummyVecEnv([Drift, Drift])):
+        check_one_max_delay(env)
 
 
 @pytest.mark.parametrize(("delay", "max_delay"), [(0, 0), (3, 3), ((1, 2), 2)])

@@ -1,6 +1,7 @@
 """Delays written as text."""
 
 import gymnasium as gym
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from random_processes import processes
@@ -15,7 +16,8 @@ from sb3_said.delays import (
     TotalDelay,
     UniformDelay,
 )
-from sb3_said.delays.text import make_process, parse_process
+from sb3_said.delays.processes import packet_delays
+from sb3_said.delays.text import age_range, make_process, parse_process
 
 
 @settings(deadline=None)
@@ -31,6 +33,9 @@ def test_processes_of_processes():
     held = parse_process("HeldDelay(TotalDelay(WIFI_20MS, (0, 2)), hold_prob=0.5)")
     assert held == HeldDelay(TotalDelay(WIFI_20MS, (0, 2)), hold_prob=0.5)
     assert make_process("DroppedPackets([0, 4], p=0.1)") == DroppedPackets(EpisodeDelay(0, 4), p=0.1)
+    assert DroppedPackets(4, p=0.1) == DroppedPackets(
+        FixedDelay(4), p=0.1
+    )  # a number is the process that it stands for
     assert hash(DroppedPackets([0, 4], p=0.1)) == hash(DroppedPackets((0, 4), p=0.1))  # YAML has no tuples
 
 
@@ -50,11 +55,36 @@ def test_processes_of_processes():
         ("UniformDelay(**{'low': 0, 'high': 8})", "is no delay"),
         ("[x for x in (1, 2)]", "is no delay"),
         ("'4'", "is no delay"),
+        ("FixedDelay(delay=4, delay=5)", "delay is given twice"),
+        ("1000000000", "at most 10000 control steps, got 1000000000"),
+        ("(0, 1000000000)", "at most 10000 control steps, got 1000000000"),
+        ("PeriodicPackets(4, 1000000000)", "at most 10000 control steps"),
+        ("DroppedPackets(4, p=0.1, max_losses=1000000000)", "at most 10000 control steps"),
+        ("TotalDelay(6000, 6000)", "at most 10000 control steps, got 12000"),
+        ("HeldDelay(4, update_period=1" + "0" * 30 + ")", "update_period is at most 1000000000"),
+        ("-" * 100_000 + "4", "is no delay"),
+        ("(" * 5_000 + "4" + ")" * 5_000, "is no delay"),
+        ("HeldDelay(" * 5_000 + "4" + ")" * 5_000, "is no delay"),
+        ("9" * 100_000, "is no delay"),
     ],
 )
 def test_anything_else_is_refused_and_not_run(text, message):
-    with pytest.raises(ValueError, match=message.replace("(", r"\(")):
-        parse_process(text)
+    with pytest.raises(ValueError, match=message.replace("(", r"\(")) as caught:
+        make_process(text)
+    assert len(str(caught.value)) < 1000
+
+
+@pytest.mark.parametrize(
+    "outer", ["HeldDelay({})", "DroppedPackets({}, p=0.1)", "PeriodicPackets({}, 2)", "TotalDelay({}, 1)"]
+)
+def test_nested_processes_take_no_longer_than_their_text(outer):
+    text = "4"
+    for _ in range(60):  # twice the time for each would be years
+        text = outer.format(text)
+    low, high = age_range(text)
+    assert 4 <= low <= high < 4 + 60 * 4 + 1
+    assert hash(make_process(text)) == hash(make_process(repr(make_process(text))))
+    assert next(packet_delays(make_process(text), np.random.default_rng(0))) in (None, *range(high + 1))
 
 
 def test_the_wrapper_takes_text():

@@ -7,7 +7,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env as check_gymnasium_env
+from gymnasium.wrappers import RecordVideo
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from logged_task import HIGH, LOW, LoggedTask, delay_of_episode
@@ -220,6 +222,69 @@ def test_bounds_whose_span_their_own_type_cannot_hold(space):
         np.testing.assert_allclose(env.step(action)[0]["action_history"], [[scaled]], atol=0.01)
 
 
+class Halving(LoggedTask):
+    """Changes the action that it is given in place, as some simulators do."""
+
+    def step(self, action):
+        answer = super().step(action)
+        action *= 0.5
+        return answer
+
+
+@pytest.mark.parametrize("action_delay", [0, 1, UniformDelay(1, 3)])
+@pytest.mark.parametrize("low", [LOW, -np.ones(2, np.float32)])
+def test_a_task_that_changes_the_action_it_is_given(action_delay, low):
+    observations, actions = [], []
+    for cls in (LoggedTask, Halving):
+        task = cls(low=low, high=HIGH if low is LOW else -low)
+        env = DelayedObservationWrapper(task, 1, action_delay)
+        env.action_space.seed(0)
+        env.reset(seed=0)
+        sent = [env.action_space.sample() for _ in range(10)]
+        kept = copy.deepcopy(sent)
+        observations.append([env.step(action) for action in sent])
+        np.testing.assert_array_equal(sent, kept)  # the caller's stay, too
+        actions.append(task.actions)
+    np.testing.assert_equal(observations[1], observations[0])
+    np.testing.assert_array_equal(actions[1], actions[0])
+
+
+@pytest.mark.parametrize(
+    ("state", "info", "message"),
+    [
+        (np.zeros(4), {}, r"observation of shape \(4,\).*expected shape \(3,\)"),
+        (np.zeros(1), {}, r"observation of shape \(1,\)"),  # which NumPy would broadcast
+        (0.0, {}, r"observation of shape \(\)"),
+        (np.zeros((1, 3)), {}, r"observation of shape \(1, 3\)"),
+        (np.array([0.0, None, 1.0]), {}, "holds object"),
+        (np.array(["0", "1", "2"]), {}, "holds <U1"),
+        (np.zeros(3, complex), {}, "holds complex128"),
+        (np.zeros(3), None, "info of type NoneType"),
+        ([[1.0], 2.0, 3.0], {}, "inhomogeneous"),
+    ],
+)
+def test_malformed_answers_of_a_task_are_refused(state, info, message):
+    task = LoggedTask()
+    env = DelayedObservationWrapper(task, 1)
+    env.reset(seed=0)
+    task.reset = lambda **_: (state, info)
+    with pytest.raises(ValueError, match=message):
+        env.reset()
+    task.step = lambda action: (state, 0.0, False, False, info)
+    with pytest.raises(ValueError, match=message):
+        env.step(env.action_space.sample())
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_a_reset_without_info_is_refused(n):
+    task = LoggedTask()
+    task.observation_space = spaces.Box(-1, 1, (n,))
+    env = DelayedObservationWrapper(task, 1)
+    task.reset = lambda **_: np.zeros(n, np.float32)
+    with pytest.raises(ValueError, match="info of type NoneType"):
+        env.reset()
+
+
 def test_history_is_bit_for_bit_the_action_where_bounds_are_one():
     env = DelayedObservationWrapper(LoggedTask(low=-np.ones(2, np.float32), high=np.ones(2, np.float32)), 1)
     env.reset(seed=0)
@@ -269,6 +334,31 @@ def test_made_again_from_its_spec():
     assert "state_known" in env.reset()[0]
 
 
+@pytest.mark.parametrize(
+    "delay",
+    [3, (1, 3), WIFI_20MS, UniformDelay(0, 2), DroppedPackets((0, 4), p=0.1), "UniformDelay(0, 2)", np.int64(2)],
+    ids=str,
+)
+def test_made_again_from_a_spec_in_a_file(delay):
+    env = DelayedObservationWrapper(gym.make("Pendulum-v1"), delay, action_delay=delay)
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    assert again.process == env.process
+
+
+class OwnProcess:
+    """A user's own, which no text can name."""
+
+    max_delay = 1
+
+    def sample(self, rng):
+        return 1
+
+
+def test_a_process_of_ones_own_is_made_again_from_its_spec():
+    env = gym.make(DelayedObservationWrapper(gym.make("Pendulum-v1"), OwnProcess()).spec)
+    assert isinstance(env.process, OwnProcess)
+
+
 def make_pendulum(delay):
     return Monitor(DelayedObservationWrapper(gym.make("Pendulum-v1", max_episode_steps=7), delay))
 
@@ -297,6 +387,49 @@ def test_in_vectorised_normalised_monitored_environments(vec_env_cls, delay):
     vec.close()
 
 
+def delayed_pendulum(env):
+    return DelayedObservationWrapper(env, UniformDelay(0, 3))
+
+
+@pytest.mark.parametrize("mode", ["sync", "async"])
+def test_in_vectorised_environments_of_gymnasium(mode):
+    vec = gym.make_vec("Pendulum-v1", 2, mode, max_episode_steps=9, wrappers=[delayed_pendulum])
+    single = [DelayedObservationWrapper(gym.make("Pendulum-v1", max_episode_steps=9), UniformDelay(0, 3))] * 2
+    obs, _ = vec.reset(seed=4)
+    assert vec.observation_space.contains(obs)
+    action = np.full((2, 1), 0.5, np.float32)
+    rows = [obs] + [vec.step(action)[0] for _ in range(8)]
+    vec.close()
+    for i, env in enumerate(single):  # each as it would be alone, from the seeds 4 and 5
+        alone = [env.reset(seed=4 + i)[0]] + [env.step(action[0])[0] for _ in range(8)]
+        for row, expected in zip(rows, alone, strict=True):
+            np.testing.assert_equal({key: value[i] for key, value in row.items()}, expected)
+
+
+class Filmed(LoggedTask):
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+    render_mode = "rgb_array"
+
+    def render(self):
+        return np.full((32, 32, 3), 10 * len(self.actions[-1]), np.uint8)
+
+
+@pytest.mark.parametrize("above", [True, False])
+def test_videos_are_recorded(above, tmp_path):
+    pytest.importorskip("moviepy")
+
+    def record(env):
+        return RecordVideo(env, str(tmp_path / "videos"), episode_trigger=lambda _: True, disable_logger=True)
+
+    task = Filmed(length=4)
+    env = record(DelayedObservationWrapper(task, 2)) if above else DelayedObservationWrapper(record(task), 2)
+    env.reset(seed=0)
+    while not env.step(env.action_space.sample())[2]:
+        pass
+    env.close()
+    assert [file.stat().st_size > 0 for file in (tmp_path / "videos").glob("*.mp4")] == [True]
+
+
 def test_wide_bounds_become_infinite():
     task = LoggedTask()
     task.observation_space = spaces.Box(-1e300, 1e300, (3,), np.float64)  # more than float32 can hold
@@ -311,9 +444,9 @@ def test_wide_bounds_become_infinite():
         ("observation_space", spaces.Box(-1, 1, ()), "FlattenObservation"),
         ("observation_space", spaces.Discrete(3), "FlattenObservation"),
         ("observation_space", spaces.Dict(a=spaces.Box(-1, 1, (3,))), "FlattenObservation"),
-        ("action_space", spaces.Discrete(3), "1-D Box action with finite bounds"),
-        ("action_space", spaces.Box(-np.inf, 1, (2,)), "1-D Box action with finite bounds"),
-        ("action_space", spaces.Box(-1, 1, (2, 2)), "1-D Box action with finite bounds"),
+        ("action_space", spaces.Discrete(3), "continuous variant"),
+        ("action_space", spaces.Box(-np.inf, 1, (2,)), "TransformAction"),
+        ("action_space", spaces.Box(-1, 1, (2, 2)), "TransformAction"),
     ],
 )
 def test_other_spaces_are_refused_with_a_remedy(attribute, space, remedy):
@@ -323,9 +456,10 @@ def test_other_spaces_are_refused_with_a_remedy(attribute, space, remedy):
         DelayedObservationWrapper(task)
 
 
-def test_wrapping_twice_is_refused():
-    with pytest.raises(ValueError, match=r"already.* 1-D Box observation.* sum of the delays") as refused:
-        DelayedObservationWrapper(DelayedObservationWrapper(LoggedTask(), 1), 1)
+@pytest.mark.parametrize("between", [lambda env: env, Monitor])
+def test_wrapping_twice_is_refused(between):
+    with pytest.raises(ValueError, match=r"already. One wrapper gives every delay") as refused:
+        DelayedObservationWrapper(between(DelayedObservationWrapper(LoggedTask(), 1, state_history=True)), 1)
     assert "Flatten" not in str(refused.value)
 
 
@@ -335,6 +469,8 @@ def test_max_delay_below_the_delay_is_refused():
     for bad in (4.5, "5", -1):
         with pytest.raises(ValueError, match=f"max_delay is a whole number >= 0, got {bad}"):
             DelayedObservationWrapper(LoggedTask(), 0, max_delay=bad)
+    with pytest.raises(ValueError, match="max_delay is at most 10000, got 1000000000"):
+        DelayedObservationWrapper(LoggedTask(), 0, max_delay=10**9)
 
 
 def test_an_unknown_receiver_is_refused():

@@ -5,6 +5,7 @@ import io
 import os
 import pickle
 import pickletools
+import resource
 import warnings
 import zipfile
 
@@ -437,13 +438,92 @@ def forge(path, place, value):
         (["parameters", "actor.optimizer", "__class__"], {}),
         (["variables"], {"log_ent_coef": 1.0}),
         (["variables", "learning_rate"], 1.0),
+        (["variables", "log_ent_coef.__class__"], th.zeros(1)),  # would change torch.nn.Parameter
+        (["parameters"], "/etc/passwd"),  # would be opened
+        (["parameters", "actor.optimizer", 0, "exp_avg"], th.full((8, 3), th.nan)),
+        (["parameters", "actor.optimizer", 0, "exp_avg"], th.zeros(8, 3, dtype=th.int32)),
+        (["parameters", "actor.optimizer", 0, "exp_avg_sq"], -th.ones(8, 3)),
+        (["parameters", "actor.optimizer", 0, "step"], th.tensor(-1.0)),
+        (["parameters", "actor.optimizer", 0, "predict"], th.zeros(8, 3)),
+        (["counters", "_n_updates"], -1),
+        (["counters", "num_timesteps"], 10**30),
+        (["counters", "_current_progress_remaining"], float("nan")),
+        (["counters", "trained_ages"], [-1]),
+        (["n_envs"], 10**9),
+        (["spaces", 1], [np.array([np.nan], np.float32)] * 2),
+        (["spaces", 1], [np.ones(1, np.float32), np.zeros(1, np.float32)]),
+        (["spaces", 0], [np.zeros((10**9, 0), np.float32)] * 2),
+        (["arguments", "gamma"], float("nan")),
+        (["arguments", "gamma"], 2.0),
+        (["arguments", "tau"], "0.5"),
+        (["arguments", "use_sde"], 1),
+        (["arguments", "buffer_size"], 10**12),
+        (["arguments", "seed"], -1),
+        (["arguments", "ent_coef"], "nan"),
+        (["arguments", "train_freq"], (0, "step")),
+        (["arguments", "learning_rate"], {"@": ["LinearSchedule", 1e-3, float("nan"), 1.0]}),
+        (["arguments", "learning_rate"], {"@": ["FloatSchedule", {"@": ["torch.nn.ReLU"]}]}),
+        (["arguments", "action_noise"], {"@": ["NormalActionNoise", 0.0, 1.0, "<U1000000000"]}),
+        (["arguments", "action_noise"], {"@": ["NormalActionNoise", np.zeros(10**6), 1.0, "<f4"]}),
     ],
-    ids=str,
+    ids=lambda value: str(value)[:40],
 )
 def test_forged_agents_are_refused(place, value, saved):
     forge(saved, place, value)
     with pytest.raises(SavedFileError, match="Cannot load"):
         DelayedSAC.load(saved, device="cpu")
+
+
+@pytest.mark.parametrize(
+    "policy_kwargs",
+    [
+        {"n_critics": 10**9},
+        {"net_arch": [10**5] * 3},
+        {"net_arch": [8] * 10**5},
+        {"net_arch": {"pi": [8], "qf": [3000] * 50}},
+    ],
+    ids=lambda value: str(value)[:40],
+)
+def test_networks_are_no_larger_than_what_the_file_holds(policy_kwargs, saved, tmp_path):
+    forge(saved, ["arguments", "policy_kwargs"], {"net_arch": [8]} | policy_kwargs)
+    make_policy().save(tmp_path / "policy")
+    forge(tmp_path / "policy", ["arguments"], {"net_arch": [8]} | policy_kwargs)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for load, path in ((DelayedSAC.load, saved), (DelayedSACPolicy.load, tmp_path / "policy")):
+        with pytest.raises(SavedFileError, match=r"ask for larger networks than it holds|not enough memory"):
+            load(path, device="cpu")
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # KiB
+    make_sac(policy_kwargs={"net_arch": [300, 300]})  # nothing is counted afterwards
+
+
+def test_an_argument_that_loading_would_refuse_is_named_when_saving(tmp_path):
+    with pytest.warns(UserWarning, match=r"lacks arguments: gamma is 1\.5, expected 0\.\.1\."):
+        make_sac(gamma=1.5).save(tmp_path / "agent")
+    with pytest.warns(UserWarning, match="lacks gamma"):
+        assert DelayedSAC.load(tmp_path / "agent", device="cpu").gamma == 0.99
+
+
+@pytest.mark.parametrize(
+    ("schedule", "kind", "rates"),
+    [
+        ("lin_1e-3", LinearSchedule, [1e-3, 5e-4, 0.0]),
+        (LinearSchedule(1e-3, 1e-4, 0.5), LinearSchedule, [1e-3, 1e-4, 1e-4]),
+        (ConstantSchedule(2e-3), ConstantSchedule, [2e-3] * 3),
+        (2e-3, float, [2e-3] * 3),
+    ],
+    ids=str,
+)
+def test_the_learning_rate_goes_on_as_it_was(schedule, kind, rates, tmp_path):
+    if schedule == "lin_1e-3":  # what rl_zoo3 makes of the text
+        schedule = pytest.importorskip("rl_zoo3.utils").linear_schedule("1e-3")
+    model = make_sac(learning_rate=schedule)
+    model.save(tmp_path / "agent")
+    loaded = DelayedSAC.load(tmp_path / "agent", env=gym.make("Pendulum-v1"), device="cpu")
+    assert type(loaded.learning_rate) is kind
+    np.testing.assert_allclose([loaded.lr_schedule(x) for x in (1.0, 0.5, 0.0)], rates, atol=1e-18)
+    loaded.learn(20)
+    progress = loaded._current_progress_remaining
+    assert loaded.actor.optimizer.param_groups[0]["lr"] == model.lr_schedule(progress)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, "float64", "shape"])
@@ -491,6 +571,7 @@ def test_loading_never_unpickles(trained, saved, monkeypatch):
     def boom(*args, **kwargs):
         raise AssertionError("something was unpickled")
 
+    DelayedSAC.load(saved, device="cpu")  # reads, once, what types its constructor declares
     for name in ("load", "loads", "Unpickler", "_Unpickler"):
         monkeypatch.setattr(pickle, name, boom)
     monkeypatch.setattr(th, "load", boom)

@@ -325,10 +325,61 @@ def test_zip_bombs_are_refused(tmp_path):
 
 
 def test_a_newer_format_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(tree_file, "FORMAT", 3)
+    monkeypatch.setattr(tree_file, "FORMAT", 4)
     save_tree(tmp_path / "tree", 1)
     monkeypatch.undo()
-    with pytest.raises(SavedFileError, match="format number is 3, this sb3_said reads up to 2: upgrade"):
+    with pytest.raises(SavedFileError, match="format number is 4, this sb3_said reads up to 3: upgrade"):
         load_tree(tmp_path / "tree")
     with pytest.raises(FileNotFoundError):
         load_tree(tmp_path / "nowhere")
+
+
+def test_a_file_that_was_changed_after_it_was_saved_is_refused(tmp_path):
+    path = tmp_path / "tree"
+    save_tree(path, {"weight": th.ones(3), "name": "a"})
+    edit(path, lambda members: members)
+    assert load_tree(path)["name"] == "a"
+    edit(path, lambda members: members, sealed=False)
+    with pytest.raises(SavedFileError, match="changed after sb3_said wrote it"):
+        load_tree(path)
+    for name, before, after in (("tree.json", b'"a"', b'"b"'), ("0.npy", th.ones(1), th.ones(1) + 1)):
+        save_tree(path, {"weight": th.ones(3), "name": "a"})
+        before, after = (x if isinstance(x, bytes) else x.numpy().tobytes() for x in (before, after))
+        comment = zipfile.ZipFile(path).comment
+        edit(path, lambda members: members | {name: members[name].replace(before, after)})  # noqa: B023
+        assert zipfile.ZipFile(path).comment != comment
+        with zipfile.ZipFile(path, "a") as archive:
+            archive.comment = comment
+        with pytest.raises(SavedFileError, match="changed after sb3_said wrote it"):
+            load_tree(path)
+
+
+def test_files_from_before_the_seal_are_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(tree_file, "FORMAT", 2)
+    save_tree(tmp_path / "tree", 1)
+    monkeypatch.undo()
+    edit(tmp_path / "tree", lambda members: members, sealed=False)
+    assert load_tree(tmp_path / "tree") == 1
+
+
+def test_a_document_of_many_small_things_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="put numbers into arrays"):
+        save_tree(tmp_path / "tree", [0.5] * 4_000_000)
+    save_tree(tmp_path / "tree", 1)
+    edit(tmp_path / "tree", lambda members: {"tree.json": "[" + "[]," * 6_000_000 + "1]"})
+    tracemalloc.start()
+    with pytest.raises(SavedFileError, match=r"tree\.json is larger"):
+        load_tree(tmp_path / "tree")
+    assert tracemalloc.get_traced_memory()[1] < 20e6
+    tracemalloc.stop()
+
+
+def test_too_little_memory_is_said(tmp_path, monkeypatch):
+    save_tree(tmp_path / "tree", th.ones(3))
+
+    def exhausted(*_, **__):
+        raise MemoryError
+
+    monkeypatch.setattr("numpy.lib.format.read_array", exhausted)
+    with pytest.raises(SavedFileError, match="more memory than there is"):
+        load_tree(tmp_path / "tree")

@@ -1,5 +1,6 @@
 """Files that are there whole or not at all, whatever happens to who writes them."""
 
+import errno
 import io
 import json
 import os
@@ -7,12 +8,11 @@ import pathlib
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 
 from sb3_said.files import atomic as files
-from sb3_said.files.atomic import replacing, write_json, write_text
+from sb3_said.files.atomic import remove_abandoned, replacing, write_json, write_text
 
 
 def test_texts_and_documents_in_folders_that_are_made(tmp_path):
@@ -46,42 +46,76 @@ def test_a_pipe_is_written_to_and_stays(tmp_path):
 def test_a_failed_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "text"
     write_text(path, "old")
-    with pytest.raises(OSError, match="disk full"), replacing(path) as file:
+    with pytest.raises(OSError, match=r"No space left on device: '.*text'"), replacing(path) as file:
         file.write(b"half of the n")
-        raise OSError("disk full")
+        raise OSError(errno.ENOSPC, "No space left on device")  # as of the operating system: it names no file
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
 
 
-def test_two_processes_may_write_one_file_at_a_time(tmp_path):
+# Writes 1 MB of its own letter to one file, over and over, when the starting line comes.
+WRITER = """
+import sys
+from sb3_said.files.archive import load_tree, save_tree
+import numpy as np
+sys.stdin.readline()
+for _ in range(20):
+    save_tree(sys.argv[1], np.full(1_000_000, ord(sys.argv[2]), np.uint8))
+    read = load_tree(sys.argv[1])
+    assert (read == read[0]).all()
+"""
+
+
+def start(code, *words, **how):
+    root = pathlib.Path(files.__file__).parents[2]  # importable from there, installed or not
+    return subprocess.Popen([sys.executable, "-c", code, *map(str, words)], cwd=root, text=True, **how)
+
+
+def test_several_processes_may_write_one_file_and_a_reader_sees_it_whole(tmp_path):
+    path = tmp_path / "tree"
+    writers = [start(WRITER, path, letter, stdin=subprocess.PIPE) for letter in "abc"]
+    for writer in writers:
+        writer.stdin.write("go\n")
+        writer.stdin.flush()
+    assert [writer.wait(120) for writer in writers] == [0, 0, 0]
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_last_to_finish_wins_however_long_it_took(tmp_path):
     path = tmp_path / "text"
     with replacing(path) as file:
+        os.utime(file.name, (0, 0))
         write_text(path, "the other's")
         assert path.read_text() == "the other's"
         file.write(b"the last to finish")
     assert path.read_text() == "the last to finish" and list(tmp_path.iterdir()) == [path]
 
 
-def test_what_a_killed_write_left_is_removed_by_a_later_one(tmp_path):
+def test_what_a_killed_write_left_is_removed_by_the_next_one(tmp_path):
     path = tmp_path / "run[1].zip"
-    script = (
+    code = (
         "import os, signal, sys\n"
         "from sb3_said.files.atomic import replacing\n"
         "with replacing(sys.argv[1]):\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"
     )
-    root = pathlib.Path(files.__file__).parents[2]  # importable from there, installed or not
-    killed = subprocess.run([sys.executable, "-c", script, str(path)], cwd=root, check=False)
-    assert killed.returncode == -signal.SIGKILL
+    assert start(code, path).wait(60) == -signal.SIGKILL
     (left,) = tmp_path.iterdir()
     assert left.name.startswith(".run[1].zip.") and left.suffix == ".tmp"
     others = {tmp_path / name for name in (".run[1].zip.mine.tmp", ".run1.zip.0123abcd.tmp", ".run[1].zip.0123abcd")}
-    for stale in (left, *others):
-        stale.touch()
-        os.utime(stale, (0, time.time() - files.ABANDONED_AFTER - 10))
+    for other in others:
+        other.touch()
     write_text(tmp_path / "run[2].zip", "2")
-    assert left.exists()  # of another file, which another process may be writing
+    assert left.exists()  # of another file
     write_text(path, "3")
     assert set(tmp_path.iterdir()) == others | {path, tmp_path / "run[2].zip"} and path.read_text() == "3"
+
+
+def test_a_folder_is_cleared_of_killed_writes_and_keeps_running_ones(tmp_path):
+    for name in (".a.0123abcd.tmp", ".b.0123abcd.tmp"):
+        (tmp_path / name).touch()
+    with replacing(tmp_path / "c") as file:
+        remove_abandoned(tmp_path)
+        assert [str(path) for path in tmp_path.iterdir()] == [file.name]
 
 
 def test_a_symbolic_link_keeps_pointing(tmp_path):

@@ -1,6 +1,7 @@
 """Checkpoints: a run that was killed goes on from one as if from a save in a game."""
 
 import copy
+import errno
 import random
 
 import gymnasium as gym
@@ -16,7 +17,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.files import checkpoint
-from sb3_said.files.archive import load_tree, save_tree
+from sb3_said.files.archive import SavedFileError, load_tree, save_tree
 from sb3_said.files.checkpoint import (
     CHECKPOINT_NAME,
     TrainingCheckpointCallback,
@@ -214,6 +215,81 @@ def test_when_checkpoints_are_written(tmp_path, monkeypatch, n_envs, save_freq, 
     assert len(written) == len(expected)  # nothing new
 
 
+def test_checkpoints_are_spread_by_time_and_size(tmp_path, monkeypatch):
+    """Ten minutes apart, and 2,000 s apart once the file has a gigabyte."""
+    written, now, size = [], [0.0], [10]
+
+    def save(path, state):
+        written.append(now[0])
+        with open(path, "wb") as file:
+            file.truncate(size[0])
+
+    class Clock(BaseCallback):
+        def _on_step(self):
+            now[0] += 100.0
+            size[0] = 10**9 if now[0] > 1500 else 10
+            return True
+
+    monkeypatch.setattr(checkpoint, "save_tree", save)
+    monkeypatch.setattr(checkpoint.time, "monotonic", lambda: now[0])
+    make().learn(60, [Clock(), TrainingCheckpointCallback(tmp_path)])
+    assert written == [600, 1200, 1800, 3800, 5800, 6000]
+
+
+def test_a_stop_is_granted_before_a_rollout(tmp_path):
+    callback = TrainingCheckpointCallback(tmp_path, should_stop=lambda: model.num_timesteps >= 40)
+    model = make()
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(100, callback)
+    assert callback.save()
+    counters = load_tree(tmp_path / CHECKPOINT_NAME)["counters"]
+    assert (counters["num_timesteps"], counters["_n_updates"]) == (40, 20)
+
+
+def test_a_full_disk_ends_no_training(tmp_path, monkeypatch):
+    path, original = run_and_kill(make(), tmp_path), checkpoint.save_tree
+    before, full = path.read_bytes(), [True]
+
+    def save(path, state):
+        if full.pop() if full else False:
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        original(path, state)
+
+    monkeypatch.setattr(checkpoint, "save_tree", save)
+    model = make()
+    callback = TrainingCheckpointCallback(tmp_path, 60)
+    with pytest.warns(UserWarning, match=r"could not be written to .*checkpoint.zip .*No space left on device"):
+        model.learn(61, callback)  # at 60 the disk is full, at the end there is room again
+    assert path.read_bytes() != before and load_tree(path)["counters"]["num_timesteps"] == 61
+    full.append(True)
+    model.num_timesteps = 62
+    with pytest.warns(UserWarning, match="step 62 could not be written"):
+        assert not callback.save()
+    assert callback.save()
+
+
+@pytest.mark.parametrize(
+    ("where", "spoil"),
+    [
+        ("replay_buffer.*rewards", lambda model: model.replay_buffer.rewards.__setitem__((3, 0), np.nan)),
+        ("replay_buffer.*observations", lambda model: model.replay_buffer.observations.__setitem__((3, 0, 1), np.inf)),
+        ("parameters.*actor.mu", lambda model: model.actor.mu.weight.data.fill_(np.nan)),
+        ("vec_normalize.*obs/observation", lambda model: model.env.obs_rms["observation"].mean.fill(np.nan)),
+    ],
+)
+def test_no_checkpoint_is_written_that_nothing_could_go_on_from(where, spoil, tmp_path):
+    path = run_and_kill(make(normalized(1)), tmp_path)
+    before = path.read_bytes()
+    model, callback = make(normalized(1)), TrainingCheckpointCallback(tmp_path, 1000)
+    callback.init_callback(model)
+    model.learn(30)
+    spoil(model)
+    with pytest.raises(ValueError, match=f"{where}.* is not finite. No checkpoint is written of it"):
+        callback.save()
+    assert path.read_bytes() == before
+    restore_training(make(normalized(1)), path)
+
+
 def test_a_checkpoint_has_every_step_and_its_updates(tmp_path):
     make().learn(60, TrainingCheckpointCallback(tmp_path, 25))
     state = load_tree(tmp_path / CHECKPOINT_NAME)
@@ -301,8 +377,21 @@ def test_other_replay_buffers_are_refused():
         (("parameters", "actor.optimizer", 0, "exp_avg"), th.zeros(7)),
         (("parameters", "actor.optimizer", 99), {}),
         (("replay_buffer", "rewards"), 3),
+        (("replay_buffer", "ages"), np.full((50, 1), 100, np.int16)),
         (("vec_normalize", "return"), 1),
+        (("vec_normalize", "return", 0), np.array(np.nan)),
+        (("vec_normalize", "return", 1), np.array(-1.0)),
+        (("vec_normalize", "obs/observation", 0), np.zeros(7)),
+        (("vec_normalize", "obs/observation", 2), float("inf")),
         (("evaluations",), [{}]),
+        (("evaluations", 0, "n_calls"), "3"),
+        (("evaluations", 0, "best_mean_reward"), float("nan")),
+        (("evaluations", 0, "evaluations_results"), [["a"]]),
+        (("evaluations", 0, "evaluations_timesteps"), [1, 2, 3]),
+        (("random", "python", 2), float("nan")),
+        (("random", "python", 2), "a"),
+        (("random", "numpy", 4), float("inf")),
+        (("random", "numpy", 2), 10**9),  # once a segmentation fault
     ],
     ids=str,
 )
@@ -314,7 +403,16 @@ def test_forged_checkpoints_are_refused(place, value, tmp_path):
     part = state
     for key in folders:
         part = part[key]
-    part[last] = value
+    if isinstance(part, tuple):
+        above = state["random"]
+        above[folders[-1]] = (*part[:last], value, *part[last + 1 :])
+    else:
+        part[last] = value
     save_tree(path, state)
-    with pytest.raises(ValueError):
-        restore_training(make(env()), path, callback)
+    model, kept = make(env()), random_state()
+    before = everything(model)
+    with pytest.raises(SavedFileError, match="Cannot load"):
+        restore_training(model, path, callback)
+    assert_same(random_state(), kept)
+    if folders[:1] != ["replay_buffer"]:  # which is taken over after the agent
+        assert_same(everything(model), before)

@@ -348,6 +348,20 @@ def test_settings_survive_json_and_others_are_refused():
             other.load_state_dict(state)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("n_updates", -1), ("n_updates", 10**9), ("n_updates", "3"), ("loss_sums", th.tensor([th.nan, 0.0]))],
+)
+def test_a_stored_training_that_none_can_be_is_refused(name, value):
+    trainer = make_trainer()
+    with pytest.raises(ValueError, match="The stored training"):
+        trainer.load_state_dict({**trainer.state_dict(), name: value})
+    state = trainer.state_dict()
+    next(iter(state["online"].values())).fill_(th.inf)
+    with pytest.raises(ValueError, match="holds NaN or infinite numbers"):
+        make_trainer().load_state_dict(state)
+
+
 def test_held_out_episodes_are_never_trained_on():
     source = make_source(20, 15)
     # Every state tells its episode

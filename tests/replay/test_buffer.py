@@ -16,7 +16,7 @@ from stable_baselines3.common.save_util import load_from_pkl, save_to_pkl
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_said.delays import UniformDelay
-from sb3_said.delays.space import UNDELAYED
+from sb3_said.delays.space import UNDELAYED, delayed_space
 from sb3_said.files.archive import load_tree, save_tree
 from sb3_said.replay.buffer import DelayedReplayBuffer
 
@@ -395,23 +395,20 @@ def test_reset_forgets_everything():
 def memory_per_transition(delay, episode_length, n_steps=5000):
     """Return bytes of all that is stored over the transitions it holds, for Ant-v5's dimensions."""
     state_space, act_space = spaces.Box(-np.inf, np.inf, (105,)), spaces.Box(-1, 1, (8,))
-    space = spaces.Dict(
-        observation=state_space, action_history=spaces.Box(-1, 1, (delay, 8)), delay=spaces.Box(0, max(delay, 1), (1,))
-    )
-    buffer = DelayedReplayBuffer(n_steps, space, act_space)
+    buffer = DelayedReplayBuffer(n_steps, delayed_space(state_space, act_space, delay), act_space)
     history, action = np.zeros((1, delay, 8), np.float32), np.zeros((1, 8), np.float32)
     for t in range(n_steps + n_steps // 2):
         step = t % episode_length
         obs, next_obs = (
             {
-                "observation": np.full((1, 105), t + k, np.float32),
+                "observation": np.full((1, 105), t + k - min(step + k, delay), np.float32),
                 "action_history": history,
                 "delay": np.array([[min(step + k, delay)]], np.float32),
             }
             for k in (0, 1)
         )
         done = np.array([step == episode_length - 1])
-        buffer.add(obs, next_obs, action, np.zeros(1), done, [{UNDELAYED: next_obs["observation"][0]}])
+        buffer.add(obs, next_obs, action, np.zeros(1), done, [{UNDELAYED: np.full(105, t + 1, np.float32)}])
     arrays = sum(x.nbytes for x in vars(buffer).values() if isinstance(x, np.ndarray))
     tails = sum(sys.getsizeof(x) for place, tail in buffer.tails.items() for x in (place, tail, *tail))
     return (arrays + tails) / n_steps
@@ -504,23 +501,96 @@ def test_a_step_between_two_observations_that_do_not_follow_each_other_is_refuse
     assert_exact(fill(buffer, rows[4:]), rows)
 
 
+def damaged(row, part, env, value):
+    """Return a step of which one environment's part is a value that it should not be."""
+    row = copy.deepcopy(row)
+    is_delayed = isinstance(row.obs, dict)
+    parts = {
+        "reward": row.reward,
+        "action": row.action,
+        "observation before the action": row.obs["observation"] if is_delayed else row.obs,
+        "observation after the action": row.next_obs,
+    }
+    if is_delayed and part == "observation after the action":
+        row.infos[env][UNDELAYED][:] = value
+    else:
+        parts[part][env] = value
+    return row
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("delay", [None, 0, 3])
+@pytest.mark.parametrize("part", ["reward", "action", "observation after the action", "observation before the action"])
+def test_what_is_not_finite_is_refused_and_nothing_of_the_step_is_stored(part, delay, value):
+    player = Player(n_envs=3, delay=delay, max_length=4, seed=3)
+    rows = player.play(20)
+    buffer = fill(make_buffer(player, 30), rows[:9])
+    before = copy.deepcopy(buffer.state_dict())
+    with pytest.raises(ValueError, match=f"The {part} of environment 2 is not finite"):
+        buffer.add(*damaged(rows[9], part, 2, value).added())
+    np.testing.assert_equal(buffer.state_dict(), before)
+    expected = fill(make_buffer(player, 30), rows)
+    assert_same_samples(expected, fill(buffer, rows[9:]))
+
+
+def test_what_float32_cannot_hold_is_refused():
+    player = Player()
+    row = player.play(1)[0]
+    with pytest.raises(ValueError, match="reward of environment 1 is not finite"):
+        make_buffer(player).add(*replace(row, reward=np.array([1.0, 1e300])).added())
+
+
+@pytest.mark.parametrize("delay", [None, 2])
+def test_a_time_limit_may_be_told_by_an_array(delay):
+    player = Player(n_envs=2, delay=delay, max_length=3)
+    rows = player.play(19)
+    told = copy.deepcopy(rows)
+    for row in told:
+        row.infos[1]["TimeLimit.truncated"] = np.array([row.infos[1]["TimeLimit.truncated"]])
+    assert any(row.infos[1]["TimeLimit.truncated"] for row in rows)
+    assert_same_samples(fill(make_buffer(player), rows), fill(make_buffer(player), told))
+
+
+def test_true_states_of_another_size_are_refused_with_what_to_do():
+    player = Player()
+    row = player.play(1)[0]
+    row.infos[1][UNDELAYED] = np.zeros(OBS_DIM + 1, np.float32)
+    with pytest.raises(ValueError, match=r"environment 1 has the shape \(4,\), .* go below DelayedObservationWrapper"):
+        make_buffer(player).add(*row.added())
+
+
+@pytest.mark.parametrize("delay", [0, 1, 3, UniformDelay(0, 3)])
+def test_observations_that_are_not_the_states_of_their_age_are_refused(delay):
+    """As a wrapper around ours makes them, by scaling or adding noise; a replay could not tell them from the states."""
+    player = Player(delay=delay, max_length=100)
+    rows = player.play(12)
+    assert not any(row.done.any() for row in rows)
+    for t in (0, 1, 2, 11):
+        row = copy.deepcopy(rows[t])
+        row.next_obs["observation"][1] *= 1.01
+        buffer = fill(make_buffer(player), rows[:t])
+        age = int(row.next_obs["delay"][1, 0])
+        with pytest.raises(
+            ValueError, match=f"environment 1 has age {age}, but is not the state of {age} steps before"
+        ):
+            buffer.add(*row.added())
+        assert_exact(fill(buffer, rows[t:]), rows)
+
+
 OTHER_BUFFERS = {
     "size": lambda: make_buffer(Player(), 19),
     "full size": lambda: make_buffer(Player(), 30),
     "environments": lambda: make_buffer(Player(n_envs=3)),
     "max_delay": lambda: make_buffer(Player(max_delay=5)),
     "no delay": lambda: make_buffer(Player(delay=None)),
-    "actions": lambda: DelayedReplayBuffer(40, delayed_space(OBS_DIM, 3), spaces.Box(-1, 1, (3,)), n_envs=2),
-    "states": lambda: DelayedReplayBuffer(40, delayed_space(OBS_DIM + 1, 2), spaces.Box(-1, 1, (2,)), n_envs=2),
+    "actions": lambda: DelayedReplayBuffer(40, *boxes(OBS_DIM, 3), n_envs=2),
+    "states": lambda: DelayedReplayBuffer(40, *boxes(OBS_DIM + 1, 2), n_envs=2),
 }
 
 
-def delayed_space(obs_dim, act_dim):
-    return spaces.Dict(
-        observation=spaces.Box(-1, 1, (obs_dim,)),
-        action_history=spaces.Box(-1, 1, (2, act_dim)),
-        delay=spaces.Box(0, 2, (1,)),
-    )
+def boxes(obs_dim, act_dim):
+    state_space, act_space = spaces.Box(-1, 1, (obs_dim,)), spaces.Box(-1, 1, (act_dim,))
+    return delayed_space(state_space, act_space, 2), act_space
 
 
 @pytest.mark.parametrize("other", OTHER_BUFFERS)
@@ -539,3 +609,42 @@ def test_a_single_action_is_not_broadcast_over_many():
     one.add(np.zeros((1, 3)), np.ones((1, 3)), np.zeros((1, 1)), np.zeros(1), np.zeros(1), [{}])
     with pytest.raises(ValueError, match="does not fit"):
         three.load_state_dict(one.state_dict())
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("pos", lambda pos: -1),
+        ("pos", lambda pos: float(pos)),
+        ("full", lambda full: 1),
+        ("observations", lambda x: np.where(x == x, np.nan, x)),
+        ("observations", lambda x: x.astype(np.float64)),
+        ("rewards", lambda x: x + np.float32(np.inf)),
+        ("ages", lambda x: x - np.int16(1000)),
+        ("ages", lambda x: x + np.int16(1000)),
+        ("next_ages", lambda x: x + np.int16(1000)),
+        ("next_states", lambda x: x[:, :1]),
+        ("steps", lambda x: -1 - x),
+        ("dones", lambda x: x + np.float32(0.5)),
+        ("ends", lambda x: ~x),
+        ("ends", lambda x: x.view(np.int8)),
+        ("tail_places", lambda x: x + 10**6),
+        ("tail_places", lambda x: np.concatenate([x[:1], x[:-1]])),
+        ("tail_states", lambda x: x[:-1]),
+        ("tail_ages", lambda x: x[:0]),
+        ("expected", lambda x: {key: value * np.nan for key, value in x.items()}),
+        ("expected", lambda x: {key: value.astype(str) for key, value in x.items()}),
+    ],
+)
+def test_what_no_buffer_stores_is_refused_and_nothing_changes(name, change):
+    players = Player(max_length=4), Player(max_length=4)
+    state = fill(make_buffer(players[0]), players[0].play(30)).state_dict()
+    assert state["full"] and len(state["tail_places"]) > 2
+    other = fill(make_buffer(players[1]), players[1].play(7))
+    before = copy.deepcopy(other.state_dict())
+    with pytest.raises(ValueError, match=r"A stored replay|The stored"):
+        other.load_state_dict({**state, name: change(state[name])})
+    for key, value in other.state_dict().items():
+        np.testing.assert_equal(value, before[key])
+    other.load_state_dict(state)
+    np.testing.assert_equal(other.state_dict(), state)

@@ -3,11 +3,15 @@
 import copy
 import inspect
 import warnings
+from functools import partial
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from kill import Kill, Killed
+from sb3_contrib.common.wrappers import TimeFeatureWrapper
 from small_task import Drift, LateDelay, OwnDelay, Simulator, delayed
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
@@ -18,11 +22,13 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.save_util import save_to_pkl
 from stable_baselines3.common.torch_layers import CombinedExtractor
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.delays import TotalDelay, UniformDelay
 from sb3_said.delays.space import UNDELAYED
+from sb3_said.files.archive import SavedFileError, save_tree
+from sb3_said.sac.policies import DelayedSACPolicy
 
 AUGMENTED = {"observation", "action_history", "delay"}
 
@@ -420,9 +426,117 @@ def test_replay_is_saved_without_pickle(tmp_path):
     save_to_pkl(tmp_path / "pickled.pkl", model.replay_buffer)
     with pytest.raises(ValueError, match="holds a pickle"):
         make().load_replay_buffer(tmp_path / "pickled.pkl")
+    for state in ({}, [], {**model.replay_buffer.state_dict(), "rewards": 3}):
+        save_tree(tmp_path / "forged", state)
+        with pytest.raises(SavedFileError, match="Cannot load"):
+            other.load_replay_buffer(tmp_path / "forged")
+
+
+def test_an_answer_that_is_not_finite_is_refused():
+    wide = spaces.Box(-3e38, 3e38, (1,), np.float32)  # finite, but high - low is not
+    policy = DelayedSACPolicy(spaces.Box(-1, 1, (2,)), wide, lambda _: 1e-3, net_arch=[8])
+    with np.errstate(all="ignore"), pytest.raises(ValueError, match="action is not finite"):
+        policy.predict(np.zeros(2, np.float32), deterministic=True)
+
+
+def test_a_replay_is_loaded_where_there_is_none(tmp_path):
+    model = make(delayed((0, 2)), relabelled_ages=0.2, replay_buffer_kwargs={"handle_timeout_termination": False})
+    model.learn(30).save_replay_buffer(tmp_path / "replay")
+    before = model.replay_buffer
+    model.replay_buffer, device = None, model.device
+    with pytest.raises(FileNotFoundError):
+        model.load_replay_buffer(tmp_path / "another")
+    assert model.replay_buffer is None
+    model.load_replay_buffer(tmp_path / "replay")
+    again = model.replay_buffer
+    np.testing.assert_equal(again.state_dict(), before.state_dict())
+    assert (again.relabelled_ages, again.handle_timeout_termination, again.device) == (0.2, False, device)
+    model.device = th.device("meta")  # as in SB3, the replay follows its agent
+    model.load_replay_buffer(tmp_path / "replay")
+    assert model.replay_buffer is again and again.device == model.device
+    model.device = again.device = device
+    assert model.learn(20, reset_num_timesteps=False).replay_buffer.size() == 50
 
 
 # ---------------------------------------------------------------------------------------------------- refusals
+
+
+class DictTask(gym.ObservationWrapper):
+    """A plain task with a dict observation, which is none of ours."""
+
+    def __init__(self):
+        super().__init__(Drift())
+        self.observation_space = spaces.Dict(vec=self.env.observation_space)
+
+    def observation(self, observation):
+        return {"vec": observation}
+
+
+ABOVE = "go below DelayedObservationWrapper"
+UNFIT = {
+    "all normalised": (lambda: VecNormalize(make_vec_env(delayed)), r"norm_obs_keys=\['observation'\]"),
+    "stacked": (lambda: VecFrameStack(make_vec_env(delayed), 3), ABOVE),
+    "a plain task": (Drift, "task in a DelayedObservationWrapper.*max_delay=2"),
+    "another max_delay": (lambda: delayed(3), "built for max_delay=2, but this environment has max_delay=3"),
+    "a history of states": (lambda: DelayedObservationWrapper(Drift(), 2, state_history=True), "do not match"),
+    "a task of another size": (lambda: DelayedObservationWrapper(gym.make("Pendulum-v1"), 2), "do not match"),
+}
+
+
+@pytest.mark.parametrize("unfit", UNFIT)
+def test_an_environment_that_does_not_fit_is_not_taken(unfit, tmp_path):
+    make_env, message = UNFIT[unfit]
+    model = make().learn(30)
+    before = model.env
+    with pytest.raises(ValueError, match=message):
+        model.set_env(make_env())
+    assert model.env is before and model.get_vec_normalize_env() is None
+    model.save(tmp_path / "agent")
+    with pytest.raises(ValueError, match=message):
+        DelayedSAC.load(tmp_path / "agent", env=make_env())
+
+
+def test_a_delayed_task_is_not_taken_where_there_was_none():
+    model = make(Drift())
+    for env in (delayed(0), delayed(2)):
+        with pytest.raises(ValueError, match=r"without a DelayedObservationWrapper, .*; leave it out"):
+            model.set_env(env)
+
+
+def test_a_normalised_environment_is_taken():
+    model = make(VecNormalize(make_vec_env(delayed), norm_obs_keys=["observation"])).learn(30)
+    model.set_env(other := VecNormalize(make_vec_env(delayed), norm_obs_keys=["observation"]))
+    assert model.learn(30).get_vec_normalize_env() is other
+
+
+@pytest.mark.parametrize(
+    ("vec_env_cls", "cls"), [(DummyVecEnv, DelayedSAC), (DummyVecEnv, SAID), (SubprocVecEnv, DelayedSAC)]
+)
+def test_environments_of_other_histories_are_refused_before_they_start(vec_env_cls, cls):
+    vec = vec_env_cls([delayed, partial(delayed, 4)])
+    try:
+        with pytest.raises(ValueError, match=r"max_delay are \[2, 4\]; give each of them .*max_delay=4\)"):
+            make(vec, cls)
+    finally:
+        vec.close()
+    model = make(DummyVecEnv([partial(delayed, max_delay=4), partial(delayed, 4)])).learn(30)
+    assert model.trained_ages == [2, 4]
+    with pytest.raises(ValueError, match=r"max_delay are \[4, 2\]"):
+        model.set_env(DummyVecEnv([partial(delayed, 4), delayed]))
+
+
+class Noisy(gym.ObservationWrapper):
+    def observation(self, observation):
+        return {**observation, "observation": observation["observation"] + np.float32(0.01)}
+
+
+@pytest.mark.parametrize("wrap", [TimeFeatureWrapper, Noisy])
+def test_wrappers_of_observations_go_below_ours(wrap):
+    with pytest.raises(ValueError, match=ABOVE):
+        make(wrap(delayed())).learn(30)
+    if wrap is TimeFeatureWrapper:
+        env = DelayedObservationWrapper(TimeFeatureWrapper(gym.wrappers.TimeLimit(Drift(), 12)), 2)
+        assert make(env).learn(30).replay_buffer.observations.shape[-1] == 3
 
 
 @pytest.mark.parametrize(
@@ -439,6 +553,7 @@ def test_replay_is_saved_without_pickle(tmp_path):
         ({"policy": "CnnPolicy"}, "CnnPolicy"),
         ({"buffer_size": 3}, "buffer_size"),
         ({"env": VecNormalize(make_vec_env(delayed))}, r"norm_obs_keys=\['observation'\]"),
+        ({"env": VecNormalize(make_vec_env(DictTask))}, "wrap the task in it"),
     ],
 )
 def test_arguments_that_cannot_work_are_refused(kwargs, message):

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import torch as th
 from kill import Kill, Killed
-from stable_baselines3.common.callbacks import CallbackList
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import KVWriter, Logger
 
 from sb3_said import SAID, DelayedObservationWrapper, PlannerTrainingCallback
+from sb3_said.files.archive import SavedFileError, load_tree, save_tree
 from sb3_said.files.checkpoint import TrainingCheckpointCallback, restore_training
 from sb3_said.planner import InpaintingPlanner
 from sb3_said.planner.trainer import PlannerTrainer
@@ -132,6 +133,49 @@ def test_a_callback_of_the_users_is_the_one_that_trains(trainings, tmp_path):
     assert begun(trainings) == [40] and (tmp_path / PLANNER_CHECKPOINT_NAME).exists()
     mine.on_training_end()  # some callers end a training twice
     assert len(trainings) == 1
+
+
+class Stopping(CallbackList):
+    """A user's own list of callbacks, which ends training itself and looks at what SB3 shows it."""
+
+    def __init__(self, children):
+        super().__init__(children)
+        self.seen = []
+
+    def _on_step(self):
+        self.seen.append((self.locals["num_collected_steps"], self.model.num_timesteps, self.callbacks[0].n_calls))
+        return super()._on_step() and self.num_timesteps < 25
+
+
+class Child(BaseCallback):
+    def _on_step(self):
+        return True
+
+
+@pytest.mark.parametrize("progress_bar", [False, True])
+@pytest.mark.parametrize("trains_itself", [False, True])
+def test_a_list_of_the_users_own_is_asked_as_a_whole(trainings, trains_itself, progress_bar):
+    own = Stopping([Child()] + [PlannerTrainingCallback()] * trains_itself)
+    model = make().learn(60, own, progress_bar=progress_bar)
+    assert model.num_timesteps == 25  # it was asked, and ended training
+    assert own.seen == [(1, t, t - 1) for t in range(1, 26)] and own.locals["self"] is model
+    assert len(trainings) == 1
+
+
+@pytest.mark.parametrize("form", ["list", "tuple", "function", "callback", "none"])
+def test_every_form_of_callbacks_that_sb3_takes(trainings, form):
+    asked = []
+
+    def ask(locals_, globals_):
+        asked.append(locals_["self"].num_timesteps)
+        return len(asked) < 7
+
+    child = Child()
+    forms = {"list": [child], "tuple": (child,), "function": ask, "callback": child, "none": None}
+    model = make().learn(30, forms[form])
+    assert asked == ([*range(1, 8)] if form == "function" else [])
+    assert child.n_calls == (30 if form in ("list", "tuple", "callback") else 0)
+    assert begun(trainings) == [6 if form == "function" else 30] and model.policy.planner_is_trained
 
 
 def test_no_network_lives_in_the_callback():
@@ -303,6 +347,26 @@ def test_a_resumed_run_loses_and_repeats_no_training(tmp_path, trainings, save_f
     assert resumed.policy.planner_updates == 6
 
 
+def test_a_stop_amid_one_of_several_trainings_loses_no_update(tmp_path, trainings):
+    asked = []
+
+    def should_stop():
+        asked.append(True)
+        return len(asked) == 4
+
+    checkpointing = TrainingCheckpointCallback(tmp_path, 1000)
+    with pytest.raises(KeyboardInterrupt):
+        make(planner_train_freq=40).learn(
+            60, [checkpointing, PlannerTrainingCallback(folder=tmp_path, should_stop=should_stop)]
+        )
+    assert checkpointing.save() and list(trainings.values()) == [4]
+    resumed = make(planner_train_freq=40)
+    restore_training(resumed, tmp_path / "checkpoint.zip")
+    trainings.clear()
+    resumed.learn(20, PlannerTrainingCallback(folder=tmp_path), reset_num_timesteps=False)
+    assert begun(trainings) == [40, 60] and list(trainings.values()) == [2, 6]
+
+
 def test_a_checkpoint_of_other_data_is_not_gone_on_from(tmp_path, trainings):
     callback = PlannerTrainingCallback(folder=tmp_path)
     first = make().learn(40, callback)
@@ -320,6 +384,16 @@ def test_a_checkpoint_of_other_settings_is_refused(tmp_path):
     make().learn(40, PlannerTrainingCallback(folder=tmp_path))
     with pytest.raises(ValueError, match="gradient_steps was 6 and is now 7"):
         make(planner_gradient_steps=7).learn(40, PlannerTrainingCallback(folder=tmp_path))
+
+
+@pytest.mark.parametrize("state", [{}, [], {"trainer": {}}], ids=str)
+def test_a_checkpoint_of_something_else_is_refused(state, tmp_path):
+    model = make().learn(40, PlannerTrainingCallback(folder=tmp_path))
+    path = tmp_path / PLANNER_CHECKPOINT_NAME
+    kept = load_tree(path)
+    save_tree(path, state if state != {"trainer": {}} else {**kept, **state})
+    with pytest.raises(SavedFileError, match="Cannot load"):
+        model.train_planner(folder=tmp_path)
 
 
 def test_unknown_intervals_are_refused_before_the_training():

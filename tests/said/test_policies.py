@@ -341,6 +341,9 @@ def test_extra_states_that_could_not_be_used_are_refused():
     vec_env = VecNormalize(make_vec_env(remembering, n_envs=1), norm_obs_keys=["observation"])
     with pytest.raises(ValueError, match=r"VecNormalize scales the observation .*norm_obs=False"):
         make(vec_env, planner_kwargs={"extra_state_probability": 0.5})
-    vec_env = VecNormalize(make_vec_env(remembering, n_envs=1), norm_obs=False)
-    make(vec_env, planner_kwargs={"extra_state_probability": 0.5})
+    rewards_only = VecNormalize(make_vec_env(remembering, n_envs=1), norm_obs=False)
+    model = make(rewards_only, planner_kwargs={"extra_state_probability": 0.5})
+    with pytest.raises(ValueError, match=r"VecNormalize scales the observation .*norm_obs=False"):
+        model.set_env(vec_env)
+    assert model.env is rewards_only
     make(planner_kwargs={"extra_state_probability": 0.5})  # trained for later use

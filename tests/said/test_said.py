@@ -16,6 +16,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_said import SAID, DelayedSAC, PlannerConfig
@@ -33,6 +34,26 @@ def test_the_expert_learns_and_acts_exactly_as_without_a_planner(planner_train_f
     expected = sac.policy.state_dict()
     th.testing.assert_close({key: said.policy.state_dict()[key] for key in expected}, expected, rtol=0, atol=0)
     th.testing.assert_close(said.log_ent_coef, sac.log_ent_coef, rtol=0, atol=0)
+
+
+class Normalized(FlattenExtractor):
+    """Normalises batches, as a user's own extractor may."""
+
+    def __init__(self, observation_space):
+        super().__init__(observation_space)
+        self.norm = th.nn.BatchNorm1d(self.features_dim)
+
+    def forward(self, observations):
+        return self.norm(super().forward(observations))
+
+
+def test_batch_norm_learns_nothing_from_the_planners_training():
+    kwargs = {"policy_kwargs": {"net_arch": [16], "features_extractor_class": Normalized}}
+    said = make(Drift(), planner_train_freq=30, **kwargs).learn(97)
+    sac = make(Drift(), DelayedSAC, **kwargs).learn(97)
+    expected = sac.policy.state_dict()
+    assert "critic.features_extractor.norm.running_mean" in expected
+    th.testing.assert_close({key: said.policy.state_dict()[key] for key in expected}, expected, rtol=0, atol=0)
 
 
 def test_the_expert_answers_until_the_planner_is_trained():

@@ -6,6 +6,7 @@ import numpy as np
 import torch as th
 
 from sb3_said import DelayedSAC
+from sb3_said.files.archive import seal
 
 
 def make_sac(env="Pendulum-v1", policy="MlpPolicy", cls=DelayedSAC, **kwargs):
@@ -43,12 +44,13 @@ def raw(tensor):
     return tensor.view(th.uint8).numpy().tobytes() if len(tensor) else b""
 
 
-def edit(path, change):
-    """Rewrite the members, as an attacker would."""
+def edit(path, change, sealed=True):
+    """Rewrite the members, and seal them anew as an attacker would."""
     with zipfile.ZipFile(path) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
     members = change(members)
     with zipfile.ZipFile(path, "w") as archive:
         for name, content in members.items():
             archive.writestr(name, content)
+        archive.comment = seal(archive) if sealed else b""
     return path

@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 
 pytest.importorskip("rl_zoo3")
 
@@ -18,6 +19,7 @@ from small_run import ENV, TINY_PLANNER, write_run
 from sb3_said import SAID, DelayedObservationWrapper
 from sb3_said.evaluation import rollout
 from sb3_said.zoo import enjoy, evaluate
+from sb3_said.zoo.record import Record
 from sb3_said.zoo.runs import load_run
 
 
@@ -37,12 +39,14 @@ def test_evaluate_measures_the_planner_and_the_expert(
         save(ax, path)
 
     monkeypatch.setattr(evaluate.plots, "save", recorded)
+    th.set_num_threads(2)
     evaluate.main([str(run), "--episodes", "3", "--n-envs", "2", "--latency-calls", "5", "--seed", "7",
                    "--plot", str(plot), "--device", "cpu"])  # fmt: skip
     document = json.loads((run / "evaluation.json").read_text())
     assert (document["algo"], document["env"], document["delay"]) == ("said", ENV, 2)
     assert (document["seed"], document["n_episodes"], document["trained_steps"]) == (7, 3, 100)
     assert [result["label"] for result in document["results"]] == ["planner", "expert"]
+    assert document["origin"]["torch_threads"] == 1  # two would wait for each other on a busy machine
     # The file holds what the library measures for the same agent and seeds.
     model = SAID.load(run / f"{ENV}.zip", device="cpu")
     for result in document["results"]:
@@ -95,8 +99,9 @@ def test_paths_that_hold_no_agent(run: Path, tmp_path: Path) -> None:
         load_run(tmp_path / "nowhere")
     with pytest.raises(ValueError, match=f"holds the runs .*{run.name}"):
         load_run(run.parent)
-    (tmp_path / ENV).mkdir()
-    (tmp_path / ENV / "args.yml").write_text("{}")
+    with pytest.raises(ValueError, match=r"holds no run: .*run.json is missing"):
+        load_run(tmp_path)
+    Record("said", ENV).write(tmp_path)
     with pytest.raises(ValueError, match="no finished agent"):
         load_run(tmp_path)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections import OrderedDict
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-import yaml
 
 pytest.importorskip("rl_zoo3")
 
@@ -23,6 +21,7 @@ from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.evaluation import Summary
 from sb3_said.zoo import evaluate, over_delays
 from sb3_said.zoo.cells import Cell, average
+from sb3_said.zoo.record import Record
 from sb3_said.zoo.runs import load_run
 
 
@@ -310,9 +309,7 @@ def test_runs_of_two_tasks_are_refused(sadr: Path, tmp_path: Path, capsys: pytes
     env = DelayedObservationWrapper(gym.make("Pendulum-v1"), delay=1)
     other = tmp_path / "other"
     DelayedSAC("MultiInputPolicy", env, buffer_size=10, device="cpu").save(other / "Pendulum-v1.zip")
-    (other / "Pendulum-v1").mkdir()
-    (other / "Pendulum-v1" / "args.yml").write_text(yaml.dump(OrderedDict(algo="sadr", env="Pendulum-v1")))
-    (other / "Pendulum-v1" / "config.yml").write_text((sadr / ENV / "config.yml").read_text())
+    Record("sadr", "Pendulum-v1", 0, 1).write(other)
     with pytest.raises(SystemExit):
         play(tmp_path / "out.json", [sadr, other], ["0"])
     assert "several tasks cannot be compared" in capsys.readouterr().err

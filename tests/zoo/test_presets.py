@@ -24,7 +24,7 @@ TASKS = ("Ant-v5", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5")
 
 def merged_settings(algo: str, preset: str, env_id: str, delay: Delay, log_folder: Path) -> dict[str, Any]:
     """Return what the command line trains with: the preset over the file's block over the constructors' defaults."""
-    run = Run([], delay, preset, 25_000)
+    run = Run(delay, preset)
     manager = DelayedExperimentManager(run, Namespace(), algo, env_id, str(log_folder), verbose=0, eval_freq=-1)
     cls, flags = ALGORITHMS[algo]
     defaults: dict[str, Any] = {}
@@ -41,7 +41,7 @@ def paper(env_id: str, delay: Delay, max_delay: int | None = None) -> PlannerCon
 
 @pytest.mark.parametrize("env_id", [*TASKS, "Pendulum-v1"])
 def test_the_default_preset_and_the_constructor_make_the_same_agent(env_id: str, tmp_path: Path) -> None:
-    run = Run([], 2, "cpu", 25_000)
+    run = Run(2, "cpu")
     manager = DelayedExperimentManager(run, Namespace(), "said", env_id, str(tmp_path), verbose=0, eval_freq=-1)
     made = manager.setup_experiment()
     assert made is not None
@@ -67,7 +67,7 @@ def test_falling_costs_where_a_task_ends_by_it(preset: str, tmp_path: Path) -> N
 
 @pytest.mark.parametrize("algo", ["sac", "sa", "dr", "sadr"])
 def test_the_default_preset_of_a_baseline_is_the_constructors(algo: str, tmp_path: Path) -> None:
-    run = Run([], 2, "cpu", 25_000)
+    run = Run(2, "cpu")
     manager = DelayedExperimentManager(run, Namespace(), algo, "Hopper-v5", str(tmp_path), verbose=0, eval_freq=-1)
     made = manager.setup_experiment()
     assert made is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 import signal
@@ -17,12 +18,15 @@ import yaml
 pytest.importorskip("rl_zoo3")
 
 from kill import Killed
+from trained_run import train_here
 
 from sb3_said import SAID, DelayedSAC
 from sb3_said.files.archive import load_tree
 from sb3_said.files.checkpoint import TrainingCheckpointCallback
 from sb3_said.zoo import manager, train
 from sb3_said.zoo.arguments import Delay
+from sb3_said.zoo.folder import log_suffix
+from sb3_said.zoo.record import Record
 from sb3_said.zoo.runs import load_run
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
@@ -37,10 +41,9 @@ def arguments(folder: Path) -> list[str]:
     return [*base.split(), *options.split(), "-f", str(folder), "-params", *params]
 
 
-def train_here(folder: Path, command: str, *more: str | Path) -> None:
-    """Train in this process, quickly and quietly."""
-    common = "--num-threads 1 --eval-freq -1 --device cpu --verbose 0 -f".split()
-    train.main([*command.split(), *common, str(folder), *map(str, more)])
+def run_of(folder: Path) -> Path:
+    """Return the run of ``arguments``."""
+    return folder / "said" / f"{ENV}-delay2-seed3_1"
 
 
 def config_of(run: Path) -> dict[str, Any]:
@@ -58,7 +61,7 @@ def assert_same_agents(left: Path, right: Path) -> None:
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("logs")
     train.main(arguments(folder))
-    return folder / "said" / f"{ENV}-delay2_1"
+    return run_of(folder)
 
 
 def test_a_run_leaves_an_agent_that_answers_with_its_planner(finished: Path) -> None:
@@ -66,10 +69,9 @@ def test_a_run_leaves_an_agent_that_answers_with_its_planner(finished: Path) -> 
     assert model.num_timesteps == 400
     assert model.policy.planner_is_trained
     assert model.policy.max_delay == 2
-    config = (finished / ENV / "config.yml").read_text()  # what enjoy and evaluate make the task from
+    assert load_run(finished, device="cpu").info["delay"] == 2
+    config = (finished / ENV / "config.yml").read_text()  # what rl_zoo3's own tools make the task from
     assert "DelayedObservationWrapper" in config and "delay: 2" in config
-    evaluations = np.load(finished / "evaluations.npz")
-    assert evaluations["timesteps"].tolist() == [200, 400]
     header = (finished / "progress.csv").read_text().splitlines()[0]
     assert "planner/present_error_mlp_d2" in header and "planner/action_error_d2" in header
 
@@ -92,7 +94,7 @@ def test_a_killed_run_goes_on_from_its_checkpoint_twice_alike(
     with pytest.raises(Killed):
         train.main(arguments(tmp_path))
     monkeypatch.undo()
-    folder = tmp_path / "said" / f"{ENV}-delay2_1"
+    folder = run_of(tmp_path)
     assert load_tree(folder / "checkpoint.zip")["counters"]["num_timesteps"] == 300
     copy = Path(shutil.copytree(folder, tmp_path / "copy"))
     for each in (folder, copy):
@@ -100,7 +102,7 @@ def test_a_killed_run_goes_on_from_its_checkpoint_twice_alike(
         assert "at step 300" in capsys.readouterr().out
     assert_same_agents(folder, copy)
     assert SAID.load(folder / f"{ENV}.zip").num_timesteps == 400
-    assert np.load(folder / "evaluations.npz")["timesteps"].tolist() == [200, 400]
+    assert np.load(folder / "expert" / "evaluations.npz")["timesteps"].tolist() == [200, 400]
 
 
 # scripts/train.py with checkpoints of the planner every 10 updates, not 1,000, that kills itself at the 15th.
@@ -125,7 +127,7 @@ def test_a_run_killed_amid_the_planners_updates_ends_as_if_it_was_not(finished: 
     code = f"SCRIPT = {str(SCRIPTS / 'train.py')!r}{KILLED_AMID_UPDATES}"
     killed = subprocess.run([sys.executable, "-c", code, *arguments(tmp_path)], capture_output=True, timeout=240)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
-    folder = tmp_path / "said" / f"{ENV}-delay2_1"
+    folder = run_of(tmp_path)
     assert load_tree(folder / "planner_checkpoint.zip")["trainer"]["n_updates"] == 10
     train.main(["--resume", str(folder)])
     assert_same_agents(finished, folder)
@@ -133,8 +135,8 @@ def test_a_run_killed_amid_the_planners_updates_ends_as_if_it_was_not(finished: 
 
 def test_a_given_agent_learns_as_many_steps_as_a_new_one(tmp_path: Path) -> None:
     command, name = "--algo said --env Pendulum-v1 --delay 1 --preset smoke -n 150 --seed 3", "Pendulum-v1.zip"
-    params = ["-params", "learning_starts:100", "planner_gradient_steps:2", TINY_PLANNER]
-    first, second = (tmp_path / "said" / f"Pendulum-v1-delay1_{k}" for k in (1, 2))
+    params = ["-params", "learning_starts:100", "planner_gradient_steps:2", "planner_trial_episodes:0", TINY_PLANNER]
+    first, second = (tmp_path / "said" / f"Pendulum-v1-delay1-seed3_{k}" for k in (1, 2))
     train_here(tmp_path, command, *params)
     train_here(tmp_path, command, "-i", first / name, *params)
     before, after = (SAID.load(run / name) for run in (first, second))
@@ -149,15 +151,21 @@ def test_a_given_agent_learns_as_many_steps_as_a_new_one(tmp_path: Path) -> None
 
 def test_a_resume_keeps_what_it_is_not_told_to_change(tmp_path: Path) -> None:
     train_here(tmp_path, "--algo dr --env Pendulum-v1 --preset smoke -n 60", "-params", "gamma:0.9", "tau:0.01")
-    run = tmp_path / "dr" / "Pendulum-v1_1"
-    before, seed = config_of(run), manager.read_arguments(run)
+    (run,) = (tmp_path / "dr").iterdir()
+    before, seed = config_of(run), Record.read(run).seed
+    assert run.name == f"Pendulum-v1-seed{seed}_1"  # drawn
     assert (before["gamma"], before["tau"], before["buffer_size"]) == (0.9, 0.01, 2000)
     for _ in range(2):
         train.main(["--resume", str(run), "-n", "80", "-params", "tau:0.02", "gradient_steps:2"])
         assert config_of(run) == {**before, "tau": 0.02, "gradient_steps": 2}
     model = DelayedSAC.load(run / "Pendulum-v1.zip")
-    assert model.num_timesteps == 80 and str(model.seed) == seed[seed.index("--seed") + 1]  # drawn, and kept
-    assert "--resume" not in manager.read_arguments(run)
+    assert model.num_timesteps == 80 and model.seed == seed  # kept
+    assert Record.read(run).options["n_timesteps"] == 80
+
+
+def test_a_folder_without_a_run_is_an_error_and_no_exit(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"holds no run: .*train_args\.json is missing"):
+        manager.read_arguments(tmp_path)
 
 
 def lengths(monitor: Path) -> list[int]:
@@ -167,7 +175,7 @@ def lengths(monitor: Path) -> list[int]:
 
 def test_episodes_after_the_checkpoint_are_not_counted_twice(tmp_path: Path) -> None:
     train_here(tmp_path, f"--algo sa --env {ENV} --preset smoke -n 200 --seed 3", "-params", "n_envs:2")
-    run = tmp_path / "sa" / f"{ENV}_1"
+    run = tmp_path / "sa" / f"{ENV}-seed3_1"
     before = [lengths(run / f"{k}.monitor.csv") for k in (0, 1)]
     for k in (0, 1):
         with (run / f"{k}.monitor.csv").open("a") as monitor:
@@ -180,17 +188,19 @@ def test_episodes_after_the_checkpoint_are_not_counted_twice(tmp_path: Path) -> 
 
 
 def test_flags_of_rl_zoo3_work_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command, agent = "--algo sadr --env Pendulum-v1 --delay 1 --preset smoke -n 120 --save-replay-buffer", "Pendulum-v1"
+    command = "--algo sadr --env Pendulum-v1 --delay 1 --preset smoke -n 120 --save-replay-buffer --seed 3"
+    agent = "Pendulum-v1"
     board, params = tmp_path / "board", ["-params", "learning_starts:60"]
     train_here(tmp_path, f"{command} --vec-env subproc -P --save-freq 50", "-tb", board, *params)
     assert "120/120" in "".join(capsys.readouterr())  # -P
-    first, second = (tmp_path / "sadr" / f"Pendulum-v1-delay1_{k}" for k in (1, 2))
+    first, second = (tmp_path / "sadr" / f"Pendulum-v1-delay1-seed3_{k}" for k in (1, 2))
     assert {path.name for path in first.glob("rl_model_*.zip")} == {f"rl_model_{n}_steps.zip" for n in (50, 100)}
-    assert list(board.glob("Pendulum-v1/Pendulum-v1-delay1_1/events.*"))
+    assert list(board.glob("Pendulum-v1/sadr/Pendulum-v1-delay1-seed3_1/events.*"))
 
     # -i finds the replay beside the agent, and goes on adding to it.
     train_here(tmp_path, command, "-i", first / f"{agent}.zip", *params)
     model = DelayedSAC.load(second / agent)
+    assert model.tensorboard_log is None  # a path of the machine that trained it
     model.load_replay_buffer(second / "replay_buffer.pkl")
     assert model.replay_buffer is not None and model.replay_buffer.size() == 240
 
@@ -203,13 +213,12 @@ def test_optimize_searches_and_writes_its_trials(tmp_path: Path) -> None:
 
 
 def test_the_delay_range_and_its_flags_reach_the_run(tmp_path: Path) -> None:
-    train_here(tmp_path, "--algo dr --env Pendulum-v1 --delay 0 3 --preset smoke -n 120")
-    folder = tmp_path / "dr" / "Pendulum-v1-delay0-3_1"
+    train_here(tmp_path, "--algo dr --env Pendulum-v1 --delay 0 3 --preset smoke -n 120 --seed 3")
+    folder = tmp_path / "dr" / "Pendulum-v1-delay0-3-seed3_1"
     model = DelayedSAC.load(folder / "Pendulum-v1.zip")
     assert (model.augment_state, model.delay_reconciled_critic) == (False, True)
     assert model.policy.max_delay == 3
-    argv = json.loads((folder / "train_args.json").read_text())
-    assert argv[argv.index("--delay") : argv.index("--delay") + 3] == ["--delay", "0", "3"]
+    assert json.loads((folder / "run.json").read_text())["delay"] == [0, 3]
 
 
 @pytest.mark.parametrize(
@@ -217,13 +226,13 @@ def test_the_delay_range_and_its_flags_reach_the_run(tmp_path: Path) -> None:
     [(None, ""), (4, "-delay4"), ([0, 8], "-delay0-8"), ("UniformDelay(0, 8)", "-delayUniformDelay-0-8")],
 )
 def test_the_log_path_names_the_delay(delay: Delay, name: str) -> None:
-    assert manager.Run([], delay, "smoke", 1).delay_name == name
+    assert manager.Run(delay, "smoke").delay_name == name
 
 
 def test_the_expert_can_learn_under_another_delay(tmp_path: Path) -> None:
-    command = "--algo said --env Pendulum-v1 --delay 0 3 --expert-delay 0 --preset smoke -n 520"
+    command = "--algo said --env Pendulum-v1 --delay 0 3 --expert-delay 0 --preset smoke -n 520 --seed 3"
     train_here(tmp_path, command, "-params", TINY_PLANNER)
-    played = load_run(tmp_path / "said" / "Pendulum-v1-delay0-3-expert0_1", device="cpu")
+    played = load_run(tmp_path / "said" / "Pendulum-v1-delay0-3-expert0-seed3_1", device="cpu")
     assert played.info["delay"] == "EpisodeDelay(low=0, high=3)"
     model = played.model
     assert isinstance(model, SAID)
@@ -243,8 +252,8 @@ def test_the_expert_can_learn_under_another_delay(tmp_path: Path) -> None:
         ("--delay -1", "whole number of control steps >= 0"),
         ("--algo sadr --delay 4 --expert-delay 0", "--expert-delay needs --algo said"),
         ("--algo said --expert-delay 0", "--expert-delay needs --algo said"),
-        ("--delay 4 --expert-delay 0 -params env_wrapper:None", "leave env_wrapper out of -params"),
         ("--resume {}", "holds no run"),
+        ("--algo said --delay 4 -optimize", "with --algo sadr -optimize, and the planner's with sb3-said tune"),
     ],
 )
 def test_says_what_is_wrong(words: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -253,12 +262,53 @@ def test_says_what_is_wrong(words: str, message: str, tmp_path: Path, capsys: py
     assert stop.value.code == 2 and message in capsys.readouterr().err
 
 
+# ---------------------------------------------------------------------------------------------------- failures
+
+
+@pytest.mark.parametrize(
+    "params", [[], ["normalize:dict(norm_obs_keys=['observation'])"]], ids=["plain", "VecNormalize"]
+)
+@pytest.mark.parametrize("nan_in", ["reward", "observation"])
+def test_a_nan_of_the_task_is_in_no_checkpoint(
+    nan_in: str, params: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import mine
+
+    monkeypatch.setattr(mine.Mine, "steps", 0)
+    command = "--algo sadr --env Mine-v0 --gym-packages mine --delay 1 --seed 3 --checkpoint-freq 20 -n 150"
+    task = ["--env-kwargs", "nan_at:90", f"nan_in:{nan_in!r}", "-params", "learning_starts:30", "buffer_size:200"]
+    with np.errstate(all="ignore"), pytest.raises(ValueError):
+        train_here(tmp_path, command, *task, *params)
+    run = tmp_path / "sadr" / "Mine-v0-delay1-seed3_1"
+    assert f"by an error; --resume {run} goes on from the last checkpoint" in capsys.readouterr().out
+    assert load_tree(run / "checkpoint.zip")["counters"]["num_timesteps"] == 80
+    train.main(["--resume", str(run)])
+    assert DelayedSAC.load(run / "Mine-v0.zip").num_timesteps == 150
+
+
+def test_a_full_disk_at_the_planners_checkpoint_loses_no_planner(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, tree: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    monkeypatch.setattr("sb3_said.said.said.save_tree", full)
+    with pytest.warns(UserWarning, match=r"written to .*planner_checkpoint.zip \(.*No space left on device"):
+        train.main(arguments(tmp_path))
+    model = SAID.load(run_of(tmp_path) / f"{ENV}.zip")
+    assert model.policy.planner_updates == 20
+
+
+# ---------------------------------------------------------------------------------------------------- the command
+
+
 def test_help_shows_both_command_lines(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         train.main(["--help"])
     assert stop.value.code == 0
     shown = capsys.readouterr().out
     assert "--delay" in shown and "--tensorboard-log" in shown and "examples:" in shown
+    assert "said,sac,sa,dr,sadr" in shown and "ppo" not in shown
 
 
 def test_the_default_preset_is_the_same_on_every_machine(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -281,6 +331,6 @@ def test_settings_given_twice_are_joined(given: str, read: str) -> None:
 def test_no_log_is_overwritten(tmp_path: Path) -> None:
     names = []
     for steps in (0, 500, 500, 500, 900, 0):
-        names.append(manager.log_suffix(tmp_path, steps))
+        names.append(log_suffix(tmp_path, steps))
         (tmp_path / f"progress{names[-1]}.csv").touch()
     assert names == ["", "_500", "_500_2", "_500_3", "_900", "_0_2"]

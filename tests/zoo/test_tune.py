@@ -24,6 +24,7 @@ from sb3_said.files.checkpoint import CHECKPOINT_NAME
 from sb3_said.zoo import tune
 from sb3_said.zoo.arguments import read_delay
 from sb3_said.zoo.best import plain_settings
+from sb3_said.zoo.record import Record
 from sb3_said.zoo.runs import LoadedRun, load_run
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "tune.py"
@@ -209,6 +210,9 @@ def test_folders_that_cannot_be_tuned(run: Path, tmp_path: Path, capsys: pytest.
 
 def test_what_yaml_cannot_hold_is_named() -> None:
     given = {"policy_kwargs": {"activation_fn": th.nn.Tanh}, "gamma": 0.9, "train_freq": (1, "step")}
-    block, left_out = plain_settings(given, {"env_kwargs": {"healthy_reward": 2.0}, "n_timesteps": -1})
+    record = Record(
+        "said", ENV, env_kwargs={"healthy_reward": 2.0}, hyperparams=given, missing={"callback": "a lambda"}
+    )
+    block, left_out = plain_settings(record)
     assert block == {"gamma": 0.9, "train_freq": [1, "step"], "env_kwargs": {"healthy_reward": 2.0}}
-    assert left_out == ["policy_kwargs"]
+    assert left_out == ["callback", "policy_kwargs"]

@@ -17,10 +17,16 @@ ENV = "InvertedPendulum-v5"
 PLANNER = "dict(depth=1, d_model=32, horizon=4, sampling_steps=1, n_candidates=2, batch_size=8)"
 
 
-def train_run(folder: Path, algo: str, *params: str, delay: Sequence[int] = (2,)) -> Path:
+def train_here(folder: Path, command: str, *more: str | Path) -> None:
+    """Train in this process, quickly and quietly."""
+    common = "--num-threads 1 --eval-freq -1 --device cpu --verbose 0 -f".split()
+    train.main([*command.split(), *common, str(folder), *map(str, more)])
+
+
+def train_run(folder: Path, algo: str, *params: str, delay: Sequence[int] = (2,), options: Sequence[str] = ()) -> Path:
     train.main(
         ["--algo", algo, "--env", ENV, "--delay", *map(str, delay), "-f", str(folder), "--seed", "3",
-         "--num-threads", "1", "--eval-freq", "-1", "--device", "cpu", "--verbose", "0", "-n", "200",
+         "--num-threads", "1", "--eval-freq", "-1", "--device", "cpu", "--verbose", "0", "-n", "200", *options,
          "-params", "learning_starts:100", "buffer_size:400", *params]
     )  # fmt: skip
     return next((folder / algo).iterdir())
@@ -33,7 +39,7 @@ def train_said(folder: Path, *params: str, delay: Sequence[int] = (2,)) -> Path:
 
 def read_by_train(best: Path, delay: Delay, folder: Path) -> dict[str, Any]:
     """Return the hyper-parameters that a training gets from a best.yml."""
-    run = Run([], delay, "cpu", 25_000)
+    run = Run(delay, "cpu")
     manager = DelayedExperimentManager(run, Namespace(), "said", ENV, str(folder), config=str(best), verbose=0)
     return manager.read_hyperparameters()[0]
 

@@ -1,0 +1,68 @@
+"""How an agent answers once its training has ended: the planner's own evaluation, in the files that rl_zoo3 reads."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import sync_envs_normalization
+
+from sb3_said import SAID
+from sb3_said.files.atomic import replacing
+from sb3_said.files.normalization import normalization_file, save_normalization
+from sb3_said.zoo.stopping import Stopping
+
+EXPERT_FOLDER = "expert"  # in the run's: what EvalCallback wrote while the expert learned
+
+
+def evaluate_answer(model: SAID, like: EvalCallback, folder: Path, stopping: Stopping) -> None:
+    """Play a trained agent as it answers, and add the returns to ``evaluations.npz`` in the run's folder.
+
+    Beside SB3's arrays, ``answers`` says who answered. The first row, of step 0, holds NaN: there was no planner yet,
+    and rl_zoo3's plots need two rows. ``best_model.zip`` is the agent of the row with the highest mean.
+
+    :param like: whose environment and number of episodes are taken
+    :param stopping: ends it with a ``KeyboardInterrupt``
+    """
+    if model.get_vec_normalize_env() is not None:
+        sync_envs_normalization(model.env, like.eval_env)  # type: ignore[arg-type]  # a trained agent has one
+
+    def on_step(*_: object) -> None:
+        if stopping.is_asked:
+            raise KeyboardInterrupt
+
+    played: Any = evaluate_policy(
+        model, like.eval_env, like.n_eval_episodes, like.deterministic, callback=on_step, return_episode_rewards=True
+    )
+    returns, lengths = played
+    path, now, who = folder / "evaluations.npz", model.num_timesteps, model.policy.who_answers
+    rows: dict[int, Sequence[Any]] = {0: ([np.nan] * len(returns), [0] * len(returns), "")}
+    if path.exists():
+        with np.load(path) as file:
+            old = [file[name].tolist() for name in ("timesteps", "results", "ep_lengths", "answers")]
+        # An evaluation of as many episodes alone can stand in one array with this.
+        rows |= {t: row for t, *row in zip(*old, strict=True) if 0 < t < now and len(row[0]) == len(returns)}
+    best = max((np.mean(row[0]) for step, row in rows.items() if step > 0), default=-np.inf)
+    rows[now] = (returns, lengths, who)
+    with replacing(path) as file:
+        results, ep_lengths, answers = zip(*rows.values(), strict=True)
+        np.savez(file, timesteps=list(rows), results=results, ep_lengths=ep_lengths, answers=answers)
+    mean = float(np.mean(returns))
+    print(f"Evaluation of the {who}: mean return {mean:.2f} over {len(returns)} episodes")
+    model.logger.record("eval/answer_mean_reward", mean)
+    model.logger.record("eval/answer_mean_ep_length", float(np.mean(lengths)))
+    model.logger.dump(model.num_timesteps)
+    if mean >= best:
+        save_with_normalization(model, folder / "best_model.zip")
+
+
+def save_with_normalization(model: SAID, path: Path) -> None:
+    """Write an agent, and beside it the normalisation that it reads its observations in."""
+    model.save(path)
+    vec_normalize = model.get_vec_normalize_env()
+    if vec_normalize is not None:
+        save_normalization(normalization_file(path), vec_normalize)

@@ -1,0 +1,67 @@
+"""A run's folder: one process claims it, and a resume continues its logs."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from sb3_said.files.atomic import remove_abandoned
+
+
+def claim_folder(parent: Path, name: str, suffix: str = "") -> Path:
+    """Make ``parent/name_K`` with the first free K after the largest there is; of two that ask, each gets its own."""
+    parent.mkdir(parents=True, exist_ok=True)
+    taken = [path.name.removeprefix(f"{name}_").split("_")[0] for path in parent.glob(f"{name}_[0-9]*")]
+    number = max([int(text) for text in taken if text.isdigit()], default=0)
+    while True:
+        number += 1
+        folder = parent / f"{name}_{number}{suffix}"
+        try:
+            folder.mkdir()  # atomic: where another process has made it, this fails
+            return folder
+        except FileExistsError:
+            continue
+
+
+def hold_folder(folder: Path) -> FileLock:
+    """Hold a run's folder until the lock is released or the process ends, and remove what killed writes left there.
+
+    :raises ValueError: while another process trains there
+    """
+    lock = FileLock(folder / "run.lock")
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        raise ValueError(f"{folder} is being trained by another process; wait until it ends, or stop it.") from None
+    remove_abandoned(folder)
+    return lock
+
+
+def log_suffix(folder: Path, steps: int) -> str:
+    """Return a suffix of ``progress.csv`` that no log has yet.
+
+    :param folder: of the run
+    :param steps: environment steps that the run has taken
+    """
+    names = ["" if steps == 0 else f"_{steps}", *(f"_{steps}_{k}" for k in range(2, 1000))]
+    return next(name for name in names if not (folder / f"progress{name}.csv").exists())
+
+
+def drop_undone_episodes(run_dir: Path, steps: int) -> None:
+    """Cut from SB3's monitor files the episodes that a resume undoes: those that ended after the checkpoint.
+
+    The episode during which the checkpoint was written is missing from the files.
+
+    :param steps: environment steps up to the checkpoint, of each environment
+    """
+    for file in run_dir.glob("*.monitor.csv"):
+        lines = file.read_bytes().splitlines(keepends=True)
+        size, taken = len(b"".join(lines[:2])), 0  # a comment and the header: r,l,t
+        for line in lines[2:]:
+            taken += int(line.split(b",")[1]) if line.endswith(b"\n") else steps + 1  # unfinished: undone, too
+            if taken > steps:
+                break
+            size += len(line)
+        os.truncate(file, size)  # in place: the environments have opened it, to append to it

@@ -1,0 +1,64 @@
+"""Ctrl-C, SIGTERM and SIGHUP as a wish, which a training grants where nothing is half done."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+
+
+class Stopping:
+    """Says whether the training has been asked to stop. A second wish is granted at once, as a ``KeyboardInterrupt``.
+
+    A signal that is ignored, as SIGHUP is under ``nohup``, stays ignored.
+    """
+
+    def __init__(self) -> None:
+        self.is_asked = self.is_forced = False
+
+    def __call__(self) -> bool:
+        return self.is_asked
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Listen to the signals inside the context; outside the main thread nobody can."""
+        before: dict[int, Any] = {}
+        if threading.current_thread() is threading.main_thread():
+            before = {number: signal.getsignal(number) for number in SIGNALS}
+            before = {number: handler for number, handler in before.items() if handler is not signal.SIG_IGN}
+        for number in before:
+            signal.signal(number, self._ask)
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    def _ask(self, number: int, frame: FrameType | None) -> None:
+        if self.is_asked:
+            self.is_forced = True
+            raise KeyboardInterrupt
+        self.is_asked = True
+        print(
+            f"\n{signal.Signals(number).name}: the training stops after this step and writes a checkpoint; the same "
+            "again stops it at once, without one.",
+            flush=True,
+        )
+
+
+@contextmanager
+def shielded() -> Iterator[None]:
+    """Start processes that ignore Ctrl-C: a terminal sends it to all, and the training needs them to its end."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,39 @@
+"""A run's folder: each process gets its own, holds it while it trains, and clears what a kill left."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from threading import Barrier
+
+import pytest
+
+pytest.importorskip("rl_zoo3")
+
+from sb3_said.zoo.folder import claim_folder, hold_folder
+
+
+def test_trainings_that_start_together_claim_folders_of_their_own(tmp_path: Path) -> None:
+    (tmp_path / "Task-delay4-seed1_7").mkdir()
+    (tmp_path / "Task-delay4-seed12_9").mkdir()  # of another seed
+    barrier = Barrier(8)
+
+    def claim(_: int) -> str:
+        barrier.wait()
+        return claim_folder(tmp_path, "Task-delay4-seed1").name
+
+    with ThreadPoolExecutor(8) as pool:
+        names = list(pool.map(claim, range(8)))
+    assert sorted(names) == sorted(f"Task-delay4-seed1_{k}" for k in range(8, 16))
+    assert claim_folder(tmp_path, "Task-delay4-seed1", "_0a-b").name == "Task-delay4-seed1_16_0a-b"
+    assert claim_folder(tmp_path, "Task-delay4-seed1").name == "Task-delay4-seed1_17"
+
+
+def test_a_folder_is_held_by_one_and_cleared_of_killed_writes(tmp_path: Path) -> None:
+    (tmp_path / ".checkpoint.zip.0123abcd.tmp").touch()
+    lock = hold_folder(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["run.lock"]
+    with pytest.raises(ValueError, match="is being trained by another process"):
+        hold_folder(tmp_path)
+    lock.release()
+    hold_folder(tmp_path).release()

@@ -1,0 +1,107 @@
+"""The task of a run: a user's wrapper under the delay, a user's package, and a loud word where there is no delay."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from argparse import Namespace
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+
+pytest.importorskip("rl_zoo3")
+
+from rl_zoo3.wrappers import TimeFeatureWrapper
+from trained_run import PLANNER, train_here
+
+from sb3_said import DelayedObservationWrapper, DelayedSAC
+from sb3_said.zoo import evaluate, manager, over_delays, train, tune
+from sb3_said.zoo.record import WRAPPER
+from sb3_said.zoo.runs import load_run
+
+PLANNED = ("planner_gradient_steps:2", "planner_trial_episodes:0", f"planner_kwargs:{PLANNER}")
+
+
+TIME = "rl_zoo3.wrappers.TimeFeatureWrapper"
+QUICK = "--preset smoke -n 40 --seed 3"
+
+
+@pytest.mark.parametrize("where", ["-params", "-conf"])
+def test_the_delay_is_around_the_users_own_wrapper(
+    where: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "own.yml"
+    config.write_text(f"default: {{n_timesteps: 40, policy: MultiInputPolicy, env_wrapper: {TIME}}}\n")
+    given = ["-params", f"env_wrapper:{TIME!r}"] if where == "-params" else ["-conf", config, "--preset", "cpu"]
+    train_here(tmp_path, f"--algo sadr --env Pendulum-v1 --delay 2 {QUICK}", *given)
+    assert "NO DELAY" not in capsys.readouterr().out
+    played = load_run(tmp_path / "sadr" / "Pendulum-v1-delay2-seed3_1", device="cpu")
+    env = played.make_env()
+    assert isinstance(env, DelayedObservationWrapper) and isinstance(env.env, TimeFeatureWrapper)
+    assert played.model.observation_space["observation"].shape == (4,)  # type: ignore[index]  # a Dict has keys
+    assert played.info["delay"] == 2
+    train.main(["--resume", str(played.folder), "-n", "60"])
+    assert DelayedSAC.load(played.folder / "Pendulum-v1.zip").num_timesteps == 60
+
+
+def test_the_experts_other_delay_is_around_the_users_own_wrapper_too(tmp_path: Path) -> None:
+    run = manager.Run(3, "cpu", expert_delay=1)
+    made = manager.DelayedExperimentManager(
+        run,
+        Namespace(),
+        "said",
+        "Pendulum-v1",
+        str(tmp_path),
+        verbose=0,
+        eval_freq=-1,
+        hyperparams={"env_wrapper": TIME},
+    ).setup_experiment()
+    assert made is not None and made[0].env is not None
+    env = made[0].env.envs[0]  # type: ignore[attr-defined]  # a DummyVecEnv
+    assert isinstance(env.env, TimeFeatureWrapper) and (env.process.delay, env.max_delay) == (1, 3)
+    assert made[1]["env_wrapper"][1:] == [{WRAPPER: {"delay": 3, "max_delay": 3}}]
+
+
+def test_a_task_without_a_delay_is_said_loudly(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    train_here(tmp_path, f"--algo sadr --env Pendulum-v1 {QUICK}")
+    assert "NO DELAY: this trains on Pendulum-v1 without any delay; --delay 4 adds" in capsys.readouterr().out
+    params = ["-params", f"env_wrapper:[{{{WRAPPER!r}: {{'delay': 1}}}}]"]
+    train_here(tmp_path, f"--algo sadr --env Pendulum-v1 {QUICK}", *params)
+    assert "NO DELAY" not in capsys.readouterr().out
+    assert load_run(tmp_path / "sadr" / "Pendulum-v1-seed3_2", device="cpu").info["delay"] == 1
+
+
+def forget_mine(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Be a process that has not imported the user's package."""
+    for registered in (gym.registry, sys.modules):
+        monkeypatch.delitem(registered, {id(gym.registry): "Mine-v0"}.get(id(registered), "mine"), raising=False)
+
+
+def test_a_run_remembers_the_package_of_its_task(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    forget_mine(monkeypatch)
+    train_here(tmp_path, f"--algo said --env Mine-v0 --gym-packages mine --delay 1 {QUICK}",
+               "--env-kwargs", "length:5", "-params", *PLANNED)  # fmt: skip
+    run = tmp_path / "said" / "Mine-v0-delay1-seed3_1"
+    few = ["--episodes", "2", "--device", "cpu"]
+    for play in (
+        lambda: evaluate.main([str(run), *few, "--latency-calls", "0"]),
+        lambda: over_delays.main([str(run), *few, "--delays", "1", "--json", str(tmp_path / "over.json")]),
+        lambda: tune.main(["--run", str(run), "--depths", "1", "--temperatures", "0", "--report-episodes", "2", *few]),
+        lambda: train.main(["--resume", str(run), "-n", "60"]),
+    ):
+        forget_mine(monkeypatch)
+        play()
+    assert json.loads((run / "evaluation.json").read_text())["results"][0]["lengths"] == [5, 5]
+    assert f"--gym-packages mine -conf {run / 'tune' / 'best.yml'}" in capsys.readouterr().out
+    alone = Path(shutil.copy(run / "Mine-v0.zip", tmp_path))
+    forget_mine(monkeypatch)
+    evaluate.main([str(alone), *few, "--latency-calls", "0", "--algo", "said", "--env", "Mine-v0",
+                   "--gym-packages", "mine"])  # fmt: skip
+    forget_mine(monkeypatch)
+    monkeypatch.setitem(sys.modules, "mine", None)
+    with pytest.raises(ImportError, match="package 'mine', which cannot be imported here: install it"):
+        load_run(run, device="cpu")

@@ -1,0 +1,166 @@
+"""Ctrl-C, SIGTERM and SIGHUP: a training writes a checkpoint, exits with 130, and goes on as if nothing had been."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rl_zoo3")
+
+from trained_run import ENV, PLANNER
+
+from sb3_said import SAID
+from sb3_said.files.archive import load_tree
+from sb3_said.planner.trainer import PlannerTrainer
+from sb3_said.sac import DelayedSAC
+from sb3_said.zoo import manager, train
+from sb3_said.zoo.stopping import Stopping
+
+SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "train.py"
+COMMAND = f"--algo said --env {ENV} --delay 2 --seed 3 --num-threads 1 --eval-freq -1 --device cpu --verbose 0"
+PARAMS = [
+    "learning_starts:50",
+    "buffer_size:400",
+    "planner_gradient_steps:20",
+    "planner_trial_episodes:1",
+    f"planner_kwargs:{PLANNER}",
+]
+
+
+def arguments(folder: Path, *more: str) -> list[str]:
+    return [*COMMAND.split(), "-n", "150", "-f", str(folder), *more, "-params", *PARAMS]
+
+
+def run_of(folder: Path) -> Path:
+    (run,) = (folder / "said").iterdir()
+    return run
+
+
+def signal_at(patch: pytest.MonkeyPatch, cls: type, method: str, call: int, number: int) -> None:
+    """Send a signal to this process in the middle of a call of a method: after it, and before what follows it."""
+    original: Callable[..., Any] = getattr(cls, method)
+    calls = iter(range(1, 10**9))
+
+    def sends(self: Any, *args: Any, **kwargs: Any) -> Any:
+        result = original(self, *args, **kwargs)
+        if next(calls) == call:
+            signal.raise_signal(number)
+        return result
+
+    patch.setattr(cls, method, sends)
+
+
+def same(left: Path, right: Path) -> bool:
+    one, other = (SAID.load(run / f"{ENV}.zip", device="cpu").policy.state_dict() for run in (left, right))
+    return all((one[key] == other[key]).all() for key in one)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("whole")
+    train.main(arguments(folder))
+    return run_of(folder)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], ids=lambda n: n.name)
+def test_a_signal_to_the_experts_training(
+    number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = signal.getsignal(number)
+    with monkeypatch.context() as patch:
+        signal_at(patch, DelayedSAC, "train", 30, number)  # of updates, the first after step 50
+        with pytest.raises(SystemExit) as stop:
+            train.main(arguments(tmp_path))
+    run = run_of(tmp_path)
+    assert stop.value.code == 130 and signal.getsignal(number) is before
+    shown = capsys.readouterr().out
+    assert f"{number.name}: the training stops after this step" in shown
+    assert f"Interrupted at step 80 and wrote a checkpoint; go on with --resume {run}" in shown
+    counters = load_tree(run / "checkpoint.zip")["counters"]
+    assert (counters["num_timesteps"], counters["_n_updates"]) == (80, 30)  # no update is lost
+    assert SAID.load(run / f"{ENV}.zip", device="cpu").num_timesteps == 80  # and what was learned is kept
+    train.main(["--resume", str(run)])
+    assert "Resuming" in capsys.readouterr().out
+    assert SAID.load(run / f"{ENV}.zip", device="cpu").num_timesteps == 150
+
+
+def test_a_signal_to_the_planners_training_loses_no_update(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with monkeypatch.context() as patch:
+        signal_at(patch, PlannerTrainer, "step", 7, signal.SIGTERM)
+        with pytest.raises(SystemExit) as stop:
+            train.main(arguments(tmp_path))
+    run = run_of(tmp_path)
+    assert stop.value.code == 130 and "go on with --resume" in capsys.readouterr().out
+    assert load_tree(run / "planner_checkpoint.zip")["trainer"]["n_updates"] == 7
+    assert not same(run, whole)
+    train.main(["--resume", str(run)])
+    assert same(run, whole)
+
+
+def test_the_same_again_stops_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    with monkeypatch.context() as patch:
+        signal_at(patch, DelayedSAC, "train", 30, signal.SIGINT)
+        signal_at(patch, DelayedSAC, "train", 30, signal.SIGTERM)
+        with pytest.raises(SystemExit) as stop:
+            train.main(arguments(tmp_path))
+    assert stop.value.code == 130 and "without a checkpoint of this step" in capsys.readouterr().out
+    assert not (run_of(tmp_path) / "checkpoint.zip").exists()  # amid an update there is nothing to go on from
+
+
+def test_an_ignored_signal_stays_ignored() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
+    try:
+        stopping = Stopping()
+        with stopping.listening():
+            signal.raise_signal(signal.SIGHUP)
+        assert not stopping.is_asked
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_a_run_is_not_resumed_while_it_is_trained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Ended(Exception):
+        pass
+
+    def resumed_meanwhile(self: manager.DelayedExperimentManager, model: Any) -> None:
+        with pytest.raises(SystemExit):
+            train.main(["--resume", self.save_path])
+        assert "is being trained by another process" in capsys.readouterr().err
+        raise Ended
+
+    monkeypatch.setattr(manager.DelayedExperimentManager, "learn", resumed_meanwhile)
+    with pytest.raises(Ended):
+        train.main(arguments(tmp_path))
+    with pytest.raises(Ended):  # the first training has ended, so that this one begins
+        train.main(["--resume", str(run_of(tmp_path))])
+
+
+def test_ctrl_c_reaches_a_training_whose_environments_are_processes(tmp_path: Path) -> None:
+    """A terminal sends it to all processes; those of the environments must outlive it."""
+    words = arguments(tmp_path, "--vec-env", "subproc")
+    words[words.index("-n") + 1] = "1000000"
+    process = subprocess.Popen(
+        [sys.executable, str(SCRIPT), *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        start_new_session=True, env={**os.environ, "PYTHONPATH": str(SCRIPT.parents[1])},
+    )  # fmt: skip
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline and not list(tmp_path.glob("said/*/progress.csv")):
+        time.sleep(0.1)
+    time.sleep(0.5)
+    os.killpg(process.pid, signal.SIGINT)
+    shown = process.communicate(timeout=120)[0]
+    assert process.returncode == 130 and "and wrote a checkpoint" in shown, shown
+    steps = load_tree(run_of(tmp_path) / "checkpoint.zip")["counters"]["num_timesteps"]
+    assert steps > 0 and f"Interrupted at step {steps}" in shown
