@@ -57,7 +57,7 @@ def delayed(episodes, process, seed=0):
 @pytest.mark.filterwarnings("ignore:compiler attribute")
 def test_delays_of_four_tasks(name, noise):
     episodes = play(name, noise)
-    for delay in range(17) if (name, noise) != ("Ant-v5", "ou") else (0, 1, 4, 8, 16):  # the slowest of them
+    for delay in (0, 1, 2, 4, 8, 12, 16) if name != "Ant-v5" else (0, 1, 8, 16):  # the slowest of them
         observations, actions, _ = delayed(episodes, FixedDelay(delay))
         found = estimate_delay(observations, actions)
         assert found.delay == delay and found.confidence >= 0.99

@@ -59,7 +59,7 @@ trees = st.recursive(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(trees)
 def test_a_tree_comes_back_bit_for_bit(tree):
     assert same(tree, round_trip(tree))
@@ -182,7 +182,7 @@ def test_every_truncation_is_a_clear_error(tmp_path):
             load_tree(path)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(st.data())
 def test_a_flipped_byte_is_an_error_or_harmless(data):
     file = io.BytesIO()

@@ -361,6 +361,13 @@ def test_other_replay_buffers_are_refused():
         training_state(model)
 
 
+@pytest.fixture(scope="module")
+def forgeable(tmp_path_factory):
+    """The checkpoint of a run whose statistics and evaluations are in it, too."""
+    folder = tmp_path_factory.mktemp("forgeable")
+    return run_and_kill(make(normalized(1)), folder, callbacks=[evaluation(folder, normalized(1))])
+
+
 @pytest.mark.parametrize(
     ("place", "value"),
     [
@@ -395,10 +402,8 @@ def test_other_replay_buffers_are_refused():
     ],
     ids=str,
 )
-def test_forged_checkpoints_are_refused(place, value, tmp_path):
-    env, callback = lambda: normalized(1), evaluation(tmp_path, normalized(1))
-    path = run_and_kill(make(env()), tmp_path, callbacks=[callback])
-    state = load_tree(path)
+def test_forged_checkpoints_are_refused(place, value, forgeable, tmp_path):
+    path, state = tmp_path / "checkpoint.zip", load_tree(forgeable)
     *folders, last = place
     part = state
     for key in folders:
@@ -409,10 +414,10 @@ def test_forged_checkpoints_are_refused(place, value, tmp_path):
     else:
         part[last] = value
     save_tree(path, state)
-    model, kept = make(env()), random_state()
+    model, kept = make(normalized(1)), random_state()
     before = everything(model)
     with pytest.raises(SavedFileError, match="Cannot load"):
-        restore_training(model, path, callback)
+        restore_training(model, path, evaluation(tmp_path, normalized(1)))
     assert_same(random_state(), kept)
     if folders[:1] != ["replay_buffer"]:  # which is taken over after the agent
         assert_same(everything(model), before)

@@ -23,7 +23,7 @@ from sb3_said.replay.windows import WindowSource
 
 pytestmark = pytest.mark.slow
 D = 3
-GRADIENT_STEPS = 800
+GRADIENT_STEPS = 550
 
 
 def train(source: WindowSource, **changes) -> PlannerTrainer:

@@ -102,7 +102,7 @@ def players_and_sizes(draw):
     return player, draw(st.integers(max_delay + 2, 30))
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(players_and_sizes(), st.integers(1, 90))
 def test_samples_are_the_transitions_themselves(player_and_size, n_steps):
     player, steps_per_env = player_and_size
@@ -110,7 +110,7 @@ def test_samples_are_the_transitions_themselves(player_and_size, n_steps):
     assert_exact(fill(make_buffer(player, steps_per_env), rows), rows)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(processes(), st.sampled_from(["newest", "independent"]), st.integers(0, 2**16), st.integers(2, 20))
 def test_samples_are_the_transitions_themselves_however_ages_jump(process, receiver, seed, spare):
     player = Player(delay=process, receiver=receiver, max_length=25, interruption=0.05, seed=seed)
@@ -131,7 +131,7 @@ def pasts_and_rows(rows):
     return found
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(players_and_sizes(), st.integers(1, 90), st.sampled_from([0.3, 1.0]))
 def test_relabelled_ages_show_what_would_have_been_observed_at_them(player_and_size, n_steps, part):
     player, steps_per_env = player_and_size
@@ -167,7 +167,7 @@ def test_that_part_of_the_ages_is_exchanged(part):
         assert np.mean(shown == age) == pytest.approx(np.mean(own == age), abs=0.02)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(st.integers(0, 5), st.sampled_from([1, 3, 10, 30]), st.integers(0, 2**16))
 def test_of_one_delay_there_is_nothing_to_exchange(delay, max_length, seed):
     player = Player(delay=delay, max_delay=5, max_length=max_length, seed=seed)
@@ -175,7 +175,7 @@ def test_of_one_delay_there_is_nothing_to_exchange(delay, max_length, seed):
     assert_exact(fill(make_buffer(player, 20, relabelled_ages=1.0), rows), rows)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(players_and_sizes(), st.integers(0, 70), st.integers(1, 50), st.integers(0, 40))
 def test_a_restored_replay_goes_on_as_if_never_saved(player_and_size, n_before, n_after, n_other):
     player, steps_per_env = player_and_size
@@ -244,14 +244,14 @@ def test_the_stored_action_is_the_one_that_histories_hold():
         np.testing.assert_allclose(buffer.actions[t], rows[t].action, atol=1e-6)
 
 
-@settings(deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(processes(), st.sampled_from(["newest", "independent"]), st.integers(0, 2**16))
 def test_actions_that_take_a_time_each_are_stored_as_they_are_executed(process, receiver, seed):
     player = Player(
         n_envs=1, delay=process, action_delay=UniformDelay(0, 3), receiver=receiver, max_length=25, seed=seed
     )
     rows = player.play(70)
-    batch = batch_arrays(fill(make_buffer(player, 80), rows).sample(1000))
+    batch = batch_arrays(fill(make_buffer(player, 80), rows).sample(200))
     first = int(rows[0].states[0, 0])
     states = {int(row.states[0, 0]): row.states[0] for row in rows}
     executed = {int(row.states[0, 0]): row.infos[0]["executed_action"] for row in rows}

@@ -135,9 +135,9 @@ def test_without_delay_it_learns_as_sb3s_sac(make_env, kwargs):
 @pytest.mark.parametrize("truncates", [True, False])
 def test_a_time_limit_is_no_end(wrap, truncates):
     model = make(
-        wrap(Drift(length=5, truncates=truncates)), gamma=0.8, ent_coef=0.0, tau=0.05, learning_rate=1e-2, batch_size=64
+        wrap(Drift(length=5, truncates=truncates)), gamma=0.8, ent_coef=0.0, tau=0.1, learning_rate=1e-2, batch_size=64
     )
-    model.learn(600)
+    model.learn(250)
     batch = model.replay_buffer.sample(200)
     with th.no_grad():
         values = th.cat(model.critic(batch.observations, batch.actions), dim=1).numpy()
@@ -283,7 +283,7 @@ def own():
     return delayed(OwnDelay())
 
 
-@pytest.mark.parametrize(("make_env", "ages"), [(Drift, [0]), (Simulator, [0]), (delayed, [2]), (own, [0, 1, 2])])
+@pytest.mark.parametrize(("make_env", "ages"), [(Simulator, [0]), (own, [0, 1, 2])])
 def test_environments_in_processes_of_their_own(make_env, ages):
     vec = make_vec_env(make_env, 2, vec_env_cls=SubprocVecEnv)
     try:

@@ -206,10 +206,10 @@ def test_a_changed_agent_is_played_again(said: Path, tmp_path: Path, monkeypatch
 
 
 def test_workers_change_the_speed_only(said: Path, tmp_path: Path) -> None:
-    delays = ["1", "WIFI_20MS", "RandomWalkDelay(0, 2, move_prob=0.5)"]  # the second needs 6 steps
+    delays = ["1", "WIFI_20MS"]  # which needs 6 steps
     one, two = (play(tmp_path / f"{n}.json", [said], delays, "--workers", n) for n in ("1", "2"))
     assert one["cells"] == two["cells"]
-    assert [cell["result"] is None for cell in two["cells"]] == [False, True, False] * 2
+    assert [cell["result"] is None for cell in two["cells"]] == [False, True] * 2
 
 
 def test_only_the_warning_of_another_delay_is_silent(sadr: Path) -> None:

@@ -163,11 +163,6 @@ def test_a_resume_keeps_what_it_is_not_told_to_change(tmp_path: Path) -> None:
     assert Record.read(run).options["n_timesteps"] == 80
 
 
-def test_a_folder_without_a_run_is_an_error_and_no_exit(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"holds no run: .*train_args\.json is missing"):
-        manager.read_arguments(tmp_path)
-
-
 def lengths(monitor: Path) -> list[int]:
     """Return the lengths of the episodes in a file of SB3's Monitor."""
     return [int(row.split(",")[1]) for row in monitor.read_text().splitlines()[2:]]
@@ -266,9 +261,8 @@ def test_says_what_is_wrong(words: str, message: str, tmp_path: Path, capsys: py
 
 
 @pytest.mark.parametrize(
-    "params", [[], ["normalize:dict(norm_obs_keys=['observation'])"]], ids=["plain", "VecNormalize"]
+    ("nan_in", "params"), [("reward", ["normalize:dict(norm_obs_keys=['observation'])"]), ("observation", [])]
 )
-@pytest.mark.parametrize("nan_in", ["reward", "observation"])
 def test_a_nan_of_the_task_is_in_no_checkpoint(
     nan_in: str, params: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

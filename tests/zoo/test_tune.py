@@ -106,11 +106,10 @@ def test_a_search_from_grid_to_report(
 @pytest.mark.parametrize(
     ("delay", "params"),
     [
-        ([0, 3], []),
-        ([2], ["normalize:dict(norm_obs_keys=['observation'])"]),
-        ([1, 2], ["normalize:dict(norm_obs=False)"]),
+        ([0, 3], ["normalize:dict(norm_obs_keys=['observation'])"]),
+        ([2], ["normalize:dict(norm_obs=False)"]),
     ],
-    ids=["drawn delay", "VecNormalize", "normalized rewards"],
+    ids=["drawn delay, VecNormalize", "normalized rewards"],
 )
 def test_a_search_with_a_drawn_delay_or_vec_normalize(
     delay: list[int], params: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
