@@ -107,7 +107,7 @@ def test_malformed_observations_are_refused_or_answered_within_bounds(agents, wh
 
     ask()
     refused = sum(answer is None for answer in answers)
-    assert 10 < refused < len(answers) - 10  # both happen
+    assert 0 < refused < len(answers)  # both happen
 
 
 @pytest.mark.parametrize("requires_grad", [True, False])

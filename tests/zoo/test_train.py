@@ -286,7 +286,7 @@ def test_a_full_disk_at_the_planners_checkpoint_loses_no_planner(
     def full(path: Path, tree: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
-    monkeypatch.setattr("sb3_said.said.said.save_tree", full)
+    monkeypatch.setattr("sb3_said.said.training.save_tree", full)
     with pytest.warns(UserWarning, match=r"written to .*planner_checkpoint.zip \(.*No space left on device"):
         train.main(arguments(tmp_path))
     model = SAID.load(run_of(tmp_path) / f"{ENV}.zip")
