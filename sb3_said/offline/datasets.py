@@ -224,17 +224,16 @@ def _of_buffer(buffer: ReplayBuffer) -> list[Columns]:
         envs = np.full(size, env)
         if isinstance(buffer, DelayedReplayBuffer):
             states, next_states = buffer.observations[rows, envs], buffer._successors(rows, envs)[0]
-            ends = buffer.ends[rows, envs]
-        elif isinstance(buffer.observations, dict):
-            key = UNDELAYED if UNDELAYED in buffer.observations else "observation"
-            states, next_states = (x[key][rows, envs] for x in (buffer.observations, buffer.next_observations))
-            ends = np.any(next_states[:-1] != states[1:], axis=1)
-            ends = np.append(ends, True)
+            breaks = buffer.ends[rows, envs]
         else:
-            states, next_states = buffer.observations[rows, envs], buffer.next_observations[rows, envs]
-            ends = np.append(np.any(next_states[:-1] != states[1:], axis=1), True)
+            parts: list[Any] = [buffer.observations, buffer.next_observations]
+            if isinstance(parts[0], dict):
+                key = UNDELAYED if UNDELAYED in parts[0] else "observation"
+                parts = [part[key] for part in parts]
+            states, next_states = (part[rows, envs] for part in parts)
+            breaks = np.append(np.any(next_states[:-1] != states[1:], axis=1), True)
         dones, timeouts = buffer.dones[rows, envs] > 0, buffer.timeouts[rows, envs] > 0
-        ends = ends | dones
+        ends = breaks | dones
         ends[-1:] = True
         columns.append(
             {

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
+import torch as th
 from stable_baselines3.common.logger import Logger
 from tqdm.auto import tqdm
 
@@ -50,7 +51,7 @@ class PlannerTraining:
         self.checkpoint = None if folder is None else Path(folder) / PLANNER_CHECKPOINT_NAME
         replay = model.replay_buffer.actions[: model.replay_buffer.size()]
         self._data = {"num_timesteps": model.num_timesteps, "replay": zlib.crc32(replay.data)}
-        self._value_losses: dict[str, float] = {}
+        self._value_losses: dict[str, th.Tensor] = {}  # of the last update; read at log times only
         if self.checkpoint is not None and self.checkpoint.exists():
             state = load_tree(self.checkpoint)
             with readable(self.checkpoint, explained=(ValueError,)):
@@ -121,13 +122,14 @@ class PlannerTraining:
         if self.values is None:
             return
         for _ in range(self.values.values.config.updates):
-            self._value_losses = {f"iql/{name}": float(loss.detach()) for name, loss in self.values.step().items()}
+            self._value_losses = self.values.step()
 
     def _log_row(self, evaluates: bool) -> float:
         """Write losses, and the held-out errors if asked for; return the loss."""
         losses = self.trainer.pop_losses()
         errors = self.trainer.evaluate() if evaluates else {}
-        self.log({**losses, **self._value_losses, **errors, "planner/n_updates": self.trainer.n_updates})
+        value_losses = {f"iql/{name}": loss.item() for name, loss in self._value_losses.items()}
+        self.log({**losses, **value_losses, **errors, "planner/n_updates": self.trainer.n_updates})
         is_end = self.trainer.n_updates == self.trainer.gradient_steps
         if is_end and (worse := worse_than_regression(errors)):
             warnings.warn(
