@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sb3_said.delays import DelayedObservationWrapper
     from sb3_said.planner import InpaintingPlanner, PlannerConfig
-    from sb3_said.sac import DelayedSAC
+    from sb3_said.sac import DelayedSAC, StableSAC
     from sb3_said.said import SAID, PlannerTrainingCallback
 
 __version__ = "0.1.0"
@@ -23,6 +23,7 @@ __all__ = [
     "InpaintingPlanner",
     "PlannerConfig",
     "PlannerTrainingCallback",
+    "StableSAC",
 ]
 _HOMES = ("delays", "planner", "sac", "said")  # of these names, each after those it imports
 _FOLDERS = (*_HOMES, "replay", "files", "offline", "evaluation", "zoo")

@@ -14,7 +14,8 @@ from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from sb3_said.delays.space import UNDELAYED, check_spaces
 from sb3_said.files.agents import SafePolicyMixin
-from sb3_said.sac.extractors import KeyExtractor, StateAugmentedExtractor
+from sb3_said.sac.extractors import KeyExtractor, NormalizedExtractor, StateAugmentedExtractor
+from sb3_said.sac.scaling import ReturnScale, StateNormalizer
 
 NOT_FINITE = (
     "The action is not finite: the observation is far larger than those of training, or the agent's weights are "
@@ -28,6 +29,8 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
     :param augment_state: the actor reads [observation, action history, age] instead of the observation alone
     :param delay_reconciled_critic: the critics read the true state, which only replay knows, instead of what the actor
         reads
+    :param normalise_states: both read z-scores of states (see :class:`~sb3_said.sac.scaling.StateNormalizer`)
+    :param scale_rewards: the critics' values are in units of a :class:`~sb3_said.sac.scaling.ReturnScale`
     :param policy_kwargs: of ``SACPolicy``
     :raises ValueError: for other spaces, or when a features extractor is given or shared in a delayed task
     """
@@ -40,11 +43,15 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         *,
         augment_state: bool = True,
         delay_reconciled_critic: bool = True,
+        normalise_states: bool = False,
+        scale_rewards: bool = False,
         **policy_kwargs: Any,
     ):
         state_space, self.max_delay = check_spaces(observation_space, action_space)
         self.augment_state = augment_state
         self.delay_reconciled_critic = delay_reconciled_critic
+        self.normalise_states = normalise_states
+        self.scale_rewards = scale_rewards
         self.replay_space: spaces.Dict | None = None
         if isinstance(observation_space, spaces.Dict):
             is_shared = policy_kwargs.get("share_features_extractor", False)
@@ -56,6 +63,14 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
             self.replay_space = spaces.Dict({**observation_space.spaces, UNDELAYED: state_space})
         super().__init__(observation_space, action_space, lr_schedule, **policy_kwargs)
 
+    def _build(self, lr_schedule: Schedule) -> None:
+        self.return_scale = ReturnScale() if self.scale_rewards else None
+        self.state_normalizer: StateNormalizer | None = None
+        if self.normalise_states:
+            state_space, _ = check_spaces(self.observation_space, self.action_space)
+            self.state_normalizer = StateNormalizer(state_space.shape[0])
+        super()._build(lr_schedule)
+
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         return super().make_actor(features_extractor or self._extractor(self.actor_kwargs, "observation"))
 
@@ -65,11 +80,13 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
 
     def _extractor(self, network_kwargs: dict[str, Any], key: str) -> BaseFeaturesExtractor | None:
         if self.replay_space is None:
-            return None
+            if self.state_normalizer is None:
+                return None
+            return NormalizedExtractor(self.make_features_extractor(), self.state_normalizer)
         network_kwargs["observation_space"] = self.replay_space
         if self.augment_state and key != UNDELAYED:
-            return StateAugmentedExtractor(self.replay_space)
-        return KeyExtractor(self.replay_space, key)
+            return StateAugmentedExtractor(self.replay_space, self.state_normalizer)
+        return KeyExtractor(self.replay_space, key, self.state_normalizer)
 
     def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
         """Turn what ``predict`` was given into float32 tensors of their own memory, after checking it.
@@ -136,6 +153,8 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
             **super()._get_constructor_parameters(),
             "augment_state": self.augment_state,
             "delay_reconciled_critic": self.delay_reconciled_critic,
+            "normalise_states": self.normalise_states,
+            "scale_rewards": self.scale_rewards,
         }
 
 

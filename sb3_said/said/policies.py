@@ -142,12 +142,13 @@ class SAIDPolicy(DelayedSACPolicy):
         return self.q_value(states, actions) if self.values is None else self.values.value(states)
 
     def q_value(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """Return min over the critics of Q(s, a): (...)."""
+        """Return min over the critics of Q(s, a), in units of the rewards that they learn from: (...)."""
         if self.critic.training:  # SB3 leaves it so; Dropout would draw, and BatchNorm learn from plans
             self.critic.set_training_mode(False)
         flat = states.flatten(0, -2)
         observation: PyTorchObs = flat if self.replay_space is None else {UNDELAYED: flat}
-        return th.cat(self.critic(observation, actions.flatten(0, -2)), dim=1).amin(1).view(states.shape[:-1])
+        values = th.cat(self.critic(observation, actions.flatten(0, -2)), dim=1).amin(1).view(states.shape[:-1])
+        return values if self.return_scale is None else values * self.return_scale.value
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         who = self.who_answers

@@ -21,6 +21,7 @@ from sb3_said.offline import IQL, ImplicitValues, OfflineAlgorithm, load_dataset
 from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.planner.values import returns_to_go
+from sb3_said.sac import StableSAC
 from sb3_said.said.callbacks import PlannerTrainingCallback
 from sb3_said.said.policies import Answer, SAIDPolicy, Value
 from sb3_said.said.training import PlannerTraining
@@ -32,10 +33,10 @@ HAND_OVER_INTERVAL = 100  # updates of an offline training
 SelfSAID = TypeVar("SelfSAID", bound="SAID")
 
 
-class SAID(OfflineAlgorithm):
+class SAID(OfflineAlgorithm, StableSAC):
     """State-Action Inpainting Diffuser, online (paper, Algorithm 1) and offline (Algorithm 2).
 
-    ``learn`` runs the expert (SADR), then trains a diffusion transformer on windows of its replay buffer. ``predict``
+    ``learn`` runs the expert (:class:`~sb3_said.sac.StableSAC`), then trains a diffusion transformer on windows of its replay buffer. ``predict``
     asks the expert until the planner is trained, and then whoever of the two does better in a few episodes. The planner
     inpaints what the delay hides and the plan behind it; at a temperature above 0 many times, and the critics choose.
     Collection always uses the expert. ``learn_offline`` trains the planner on logs instead, without an expert.
@@ -55,7 +56,7 @@ class SAID(OfflineAlgorithm):
         with the expert; the better one answers. They come on top of ``learn``'s steps. 0: the planner answers
     :param value: who scores the planner's candidates: ``"critics"``, the expert's, by min Q(s, a); or ``"iql"``, a
         V(s) that is learned beside the planner by implicit Q-learning, which is what offline learning has
-    :param sac_kwargs: every other argument of :class:`~sb3_said.sac.DelayedSAC` and of SB3's ``SAC``
+    :param sac_kwargs: every other argument of :class:`~sb3_said.sac.StableSAC`, the expert, and of SB3's ``SAC``
     :raises ValueError: as ``DelayedSAC`` does, for planner settings outside their range, and for a ``state_history``
         in the observations that the planner is not trained to read or that ``VecNormalize`` leaves unscaled
     """

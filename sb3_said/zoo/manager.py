@@ -17,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalC
 from stable_baselines3.common.logger import Logger, make_output_format
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_said import SAID, DelayedSAC, PlannerTrainingCallback
+from sb3_said import SAID, DelayedSAC, PlannerTrainingCallback, StableSAC
 from sb3_said.files.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback, restore_training
 from sb3_said.files.normalization import load_normalization, normalization_file, save_normalization
 from sb3_said.zoo.answer import EXPERT_FOLDER, evaluate_answer
@@ -34,6 +34,7 @@ ALGORITHMS: dict[str, tuple[type[DelayedSAC], dict[str, bool]]] = {
     "sa": (DelayedSAC, {"augment_state": True, "delay_reconciled_critic": False}),
     "dr": (DelayedSAC, {"augment_state": False, "delay_reconciled_critic": True}),
     "sadr": (DelayedSAC, {"augment_state": True, "delay_reconciled_critic": True}),
+    "stable": (StableSAC, {}),
 }
 for _name, (_class, _) in ALGORITHMS.items():
     ALGOS[_name] = _class

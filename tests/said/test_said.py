@@ -1,4 +1,4 @@
-"""SAID: an expert that learns as DelayedSAC does, a planner that answers, and files that bring back both."""
+"""SAID: an expert that learns as StableSAC does, a planner that answers, and files that bring back both."""
 
 import inspect
 import warnings
@@ -19,7 +19,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_said import SAID, DelayedSAC, PlannerConfig
+from sb3_said import SAID, PlannerConfig, StableSAC
 from sb3_said.delays import TotalDelay, UniformDelay
 
 # ---------------------------------------------------------------------------------------------------- the expert
@@ -28,7 +28,7 @@ from sb3_said.delays import TotalDelay, UniformDelay
 @pytest.mark.parametrize("planner_train_freq", [None, 30])
 def test_the_expert_learns_and_acts_exactly_as_without_a_planner(planner_train_freq):
     said = make(planner_train_freq=planner_train_freq).learn(100)
-    sac = make(cls=DelayedSAC).learn(100)
+    sac = make(cls=StableSAC).learn(100)
     assert said.policy.planner_is_trained and said._n_updates == sac._n_updates == 80
     assert same_replay(said, sac)  # collection never asked the planner
     expected = sac.policy.state_dict()
@@ -50,7 +50,7 @@ class Normalized(FlattenExtractor):
 def test_batch_norm_learns_nothing_from_the_planners_training():
     kwargs = {"policy_kwargs": {"net_arch": [16], "features_extractor_class": Normalized}}
     said = make(Drift(), planner_train_freq=30, **kwargs).learn(97)
-    sac = make(Drift(), DelayedSAC, **kwargs).learn(97)
+    sac = make(Drift(), StableSAC, **kwargs).learn(97)
     expected = sac.policy.state_dict()
     assert "critic.features_extractor.norm.running_mean" in expected
     th.testing.assert_close({key: said.policy.state_dict()[key] for key in expected}, expected, rtol=0, atol=0)
@@ -58,7 +58,7 @@ def test_batch_norm_learns_nothing_from_the_planners_training():
 
 def test_the_expert_answers_until_the_planner_is_trained():
     said, obs = make(), observe()
-    sac = make(cls=DelayedSAC)
+    sac = make(cls=StableSAC)
     np.testing.assert_allclose(answer(said, obs), answer(sac, obs), rtol=1e-5)
     with pytest.raises(ValueError, match="not trained yet"), said.policy.answering("planner"):
         pass
@@ -93,7 +93,7 @@ def test_callbacks_are_answered_by_the_expert_while_learning(trained, tmp_path):
     evaluation, asked = EvalCallback(Monitor(delayed()), eval_freq=10, n_eval_episodes=2, verbose=0), Asked(observe())
     model = make(planner_train_freq=30).learn(100, CallbackList([evaluation, asked]))
     sac_evaluation = EvalCallback(Monitor(delayed()), eval_freq=10, n_eval_episodes=2, verbose=0)
-    make(cls=DelayedSAC).learn(100, sac_evaluation)
+    make(cls=StableSAC).learn(100, sac_evaluation)
     np.testing.assert_allclose(evaluation.evaluations_results, sac_evaluation.evaluations_results, rtol=1e-4)
     assert np.array_equal(asked.ours, asked.experts)
     assert not np.allclose(answer(model, asked.obs), asked.ours[-1])  # and by the planner afterwards
@@ -164,8 +164,8 @@ def test_arguments_that_cannot_work_are_refused(kwargs, message):
     [
         (SAID, "planner_kwarg", "planner_kwargs"),
         (SAID, "gradient_stpes", "gradient_steps"),
-        (DelayedSAC, "augmented_state", "augment_state"),
-        (DelayedSAC, "tensorboard_logs", "tensorboard_log"),
+        (StableSAC, "augmented_state", "augment_state"),
+        (StableSAC, "tensorboard_logs", "tensorboard_log"),
     ],
 )
 def test_an_unknown_argument_is_told_the_nearest(cls, name, nearest):
@@ -213,8 +213,8 @@ def test_a_file_with_pickles_is_refused(trained, tmp_path):
 
 
 def test_another_algorithms_file_is_refused(tmp_path):
-    make(cls=DelayedSAC).save(tmp_path / "sac")
-    with pytest.raises(ValueError, match="kind 'DelayedSAC', where 'SAID' was expected"):
+    make(cls=StableSAC).save(tmp_path / "sac")
+    with pytest.raises(ValueError, match="kind 'StableSAC', where 'SAID' was expected"):
         SAID.load(tmp_path / "sac")
 
 

@@ -1,0 +1,70 @@
+"""Running scales of rewards and states, which are part of an agent's networks and of its file."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch as th
+from torch import nn
+
+LARGEST_SCALED_RETURN = 5.0  # of SimbaV2: the returns that its critic can tell apart end there
+SMALLEST_DEVIATION = 1e-4  # of a state's entry, in its own units
+LARGEST_SCORE = 10.0  # of SB3's VecNormalize
+
+
+class ReturnScale(nn.Module):
+    """The size of discounted returns so far, which rewards are divided by (SimbaV2, https://arxiv.org/abs/2502.15280).
+
+    Of every step's running return G_t = gamma G_{t-1} + r_t it keeps mean and variance, and the largest one:
+    ``value`` = max(sd(G), max |G| / 5), and 1 before the first.
+    """
+
+    mean: th.Tensor
+    variance: th.Tensor
+    count: th.Tensor
+    largest: th.Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        for name, start in (("mean", 0.0), ("variance", 1.0), ("count", 1e-4), ("largest", 0.0)):
+            self.register_buffer(name, th.tensor(start, dtype=th.float64))
+
+    def update(self, returns: np.ndarray) -> None:
+        """Count the running returns of a step, (n_envs,) (Chan et al.'s parallel variance)."""
+        batch = th.as_tensor(returns, dtype=th.float64, device=self.mean.device)
+        difference, total = batch.mean() - self.mean, self.count + len(batch)
+        squares = self.variance * self.count + batch.var(correction=0) * len(batch)
+        self.variance.copy_((squares + difference**2 * self.count * len(batch) / total) / total)
+        self.mean.add_(difference * len(batch) / total)
+        self.count.copy_(total)
+        self.largest.copy_(th.maximum(self.largest, batch.abs().max()))
+
+    @property
+    def value(self) -> float:
+        return max(float(self.variance) ** 0.5, float(self.largest) / LARGEST_SCALED_RETURN) or 1.0
+
+
+class StateNormalizer(nn.Module):
+    """z-scores of states, (s - mean) / sd, cut at +-10. Before its first fit it changes nothing but that.
+
+    :param obs_dim: of a state
+    """
+
+    mean: th.Tensor
+    deviation: th.Tensor
+    fitted_at: th.Tensor
+
+    def __init__(self, obs_dim: int):
+        super().__init__()
+        self.register_buffer("mean", th.zeros(obs_dim))
+        self.register_buffer("deviation", th.ones(obs_dim))
+        self.register_buffer("fitted_at", th.zeros((), dtype=th.float64))  # environment steps
+
+    def fit(self, states: th.Tensor, n_steps: int) -> None:
+        """Take mean and standard deviation of states, (N, obs_dim), which were replayed at this environment step."""
+        self.mean.copy_(states.mean(0))
+        self.deviation.copy_(states.std(0, correction=0) + SMALLEST_DEVIATION)
+        self.fitted_at.fill_(float(n_steps))
+
+    def forward(self, states: th.Tensor) -> th.Tensor:
+        """Normalise states: (..., obs_dim) -> (..., obs_dim)."""
+        return ((states - self.mean) / self.deviation).clamp(-LARGEST_SCORE, LARGEST_SCORE)

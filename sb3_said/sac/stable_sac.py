@@ -1,0 +1,172 @@
+"""A steadier expert: SADR on scaled rewards and normalised states, with a small entropy bonus and a slower actor."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.utils import polyak_update
+
+from sb3_said.delays.space import UNDELAYED
+from sb3_said.sac.delayed_sac import DelayedSAC
+from sb3_said.sac.policies import DelayedSACPolicy
+
+REFIT_GROWTH = 1.1  # the states are looked at again when there are a tenth more of them
+STATES_LOOKED_AT = 10_000
+
+
+class StableSAC(DelayedSAC):
+    """:class:`DelayedSAC` whose returns rise and stay: what the field has found since SAC, as far as it helps here.
+
+    Four parts, measured in results/stable_expert.md:
+
+    - rewards are divided by the size of the returns so far (SimbaV2, https://arxiv.org/abs/2502.15280, section 4.4), so
+      that the critics' units stay the same while the policy improves;
+    - states are z-scored, with the statistics of replay; actions and ages are in [-1, 1] as they are;
+    - in those units the entropy coefficient starts at 0.01, and the target is half of SAC's;
+    - actor and entropy coefficient are updated every second step (TD3, https://arxiv.org/abs/1802.09477, section 5.2).
+
+    With ``scale_rewards=False, normalise_states=False, policy_delay=1, ent_coef="auto", target_entropy="auto"`` it is
+    ``DelayedSAC``, but for the order of an update, where the critics come first.
+
+    :param policy: ``"MultiInputPolicy"`` or ``"MlpPolicy"``, which name the same class
+    :param env: a task in a ``DelayedObservationWrapper``, or one with a 1-D Box observation (delay 0)
+    :param learning_rate: of actor, critics and entropy coefficient; a number or a schedule
+    :param scale_rewards: learn from rewards divided by :class:`~sb3_said.sac.scaling.ReturnScale`
+    :param normalise_states: actor and critics read z-scores of states
+    :param policy_delay: updates of the critics for each of the actor
+    :param ent_coef: SAC's, in units of scaled rewards
+    :param target_entropy: SAC's; ``"half"`` is -act_dim / 2, ``"auto"`` is -act_dim
+    :param sac_kwargs: every other argument of :class:`DelayedSAC`
+    :raises ValueError: as ``DelayedSAC`` does, and for a ``policy_delay`` below 1
+    """
+
+    policy: DelayedSACPolicy
+
+    def __init__(
+        self,
+        policy: str | type[DelayedSACPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 3e-4,
+        *,
+        scale_rewards: bool = True,
+        normalise_states: bool = True,
+        policy_delay: int = 2,
+        ent_coef: str | float = "auto_0.01",
+        target_entropy: str | float = "half",
+        **sac_kwargs: Any,
+    ):
+        if policy_delay < 1:
+            raise ValueError(f"policy_delay must be at least 1, got {policy_delay}.")
+        self.scale_rewards = scale_rewards
+        self.normalise_states = normalise_states
+        self.policy_delay = policy_delay
+        self._running_returns = np.zeros(1)  # (n_envs,) G_t of the episodes that are being played
+        super().__init__(policy, env, learning_rate, ent_coef=ent_coef, target_entropy=target_entropy, **sac_kwargs)
+
+    def _setup_model(self) -> None:
+        if self.target_entropy == "half":
+            self.target_entropy = -0.5 * float(np.prod(self.action_space.shape or ()))
+        super()._setup_model()
+
+    def _policy_flags(self) -> dict[str, Any]:
+        flags = {"normalise_states": self.normalise_states, "scale_rewards": self.scale_rewards}
+        return {**super()._policy_flags(), **flags}
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        learn = super()._setup_learn(*args, **kwargs)
+        self._running_returns = np.zeros(self.n_envs)
+        return learn
+
+    def _store_transition(
+        self,
+        replay_buffer: Any,
+        buffer_action: np.ndarray,
+        new_obs: Any,
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        if self.policy.return_scale is not None:
+            self._running_returns = self.gamma * self._running_returns + reward
+            self.policy.return_scale.update(self._running_returns)
+            self._running_returns = self._running_returns * (1 - dones)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+
+    def _look_at_states(self) -> None:
+        """Take the statistics of the states in replay, unless they are hardly more than last time."""
+        normalizer = self.policy.state_normalizer
+        if normalizer is not None and self.num_timesteps >= REFIT_GROWTH * float(normalizer.fitted_at):
+            seen = self.replay_buffer.sample(STATES_LOOKED_AT, env=self._vec_normalize_env).observations
+            normalizer.fit(seen[UNDELAYED] if isinstance(seen, dict) else seen, self.num_timesteps)
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """Update critics, and every ``policy_delay`` steps actor and entropy coefficient, on batches from replay."""
+        self.policy.set_training_mode(True)
+        learned = [self.actor.optimizer, self.critic.optimizer]
+        self._update_learning_rate(learned if self.ent_coef_optimizer is None else [*learned, self.ent_coef_optimizer])
+        self._look_at_states()
+        scale = 1.0 if self.policy.return_scale is None else self.policy.return_scale.value
+        losses: dict[str, list[float]] = {"critic_loss": [], "actor_loss": [], "ent_coef_loss": []}
+
+        for _ in range(gradient_steps):
+            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            ent_coef = self._ent_coef()
+            if self.use_sde:
+                self.actor.reset_noise()
+
+            # Critics: soft Bellman targets, in units of scaled rewards
+            with th.no_grad():
+                next_actions, next_log_prob = self.actor.action_log_prob(batch.next_observations)  # (B, act_dim), (B,)
+                next_q = th.cat(self.critic_target(batch.next_observations, next_actions), dim=1)  # (B, n_critics)
+                next_value = next_q.amin(1, keepdim=True) - ent_coef * next_log_prob.reshape(-1, 1)
+                target = batch.rewards / scale + (1 - batch.dones) * self.gamma * next_value  # (B, 1)
+            q = th.stack(self.critic(batch.observations, batch.actions))  # (n_critics, B, 1)
+            critic_loss = 0.5 * (q - target).square().mean(1).sum()
+            self.critic.optimizer.zero_grad()
+            critic_loss.backward()
+            self.critic.optimizer.step()
+            losses["critic_loss"].append(critic_loss.item())
+
+            self._n_updates += 1
+            if self._n_updates % self.policy_delay == 0:
+                # Actor
+                actions, log_prob = self.actor.action_log_prob(batch.observations)
+                log_prob = log_prob.reshape(-1, 1)  # (B, 1)
+                self.critic.requires_grad_(False)
+                value = th.cat(self.critic(batch.observations, actions), dim=1).amin(1, keepdim=True)  # (B, 1)
+                self.critic.requires_grad_(True)
+                actor_loss = (ent_coef * log_prob - value).mean()
+                self.actor.optimizer.zero_grad()
+                actor_loss.backward()
+                self.actor.optimizer.step()
+                losses["actor_loss"].append(actor_loss.item())
+
+                # Entropy coefficient
+                if self.ent_coef_optimizer is not None:
+                    assert self.log_ent_coef is not None and isinstance(self.target_entropy, float)
+                    ent_coef_loss = -(self.log_ent_coef * (log_prob.detach() + self.target_entropy)).mean()
+                    self.ent_coef_optimizer.zero_grad()
+                    ent_coef_loss.backward()
+                    self.ent_coef_optimizer.step()
+                    losses["ent_coef_loss"].append(ent_coef_loss.item())
+
+            if self._n_updates % self.target_update_interval == 0:
+                polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
+                polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
+
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("train/ent_coef", float(self._ent_coef()))
+        self.logger.record("train/reward_scale", scale)
+        for name, values in losses.items():
+            if values:
+                self.logger.record(f"train/{name}", float(np.mean(values)))
+
+    def _ent_coef(self) -> th.Tensor:
+        if self.ent_coef_optimizer is None:
+            return self.ent_coef_tensor
+        assert self.log_ent_coef is not None
+        return self.log_ent_coef.detach().exp()

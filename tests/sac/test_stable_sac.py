@@ -1,0 +1,204 @@
+"""StableSAC: scales of rewards and states against NumPy and SB3, values in the rewards' own units, a slower actor."""
+
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from small_agent import make as make_agent
+from small_task import Drift, delayed
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import VecNormalize
+from torch.nn import functional as F
+
+from sb3_said import SAID, DelayedSAC, StableSAC
+from sb3_said.delays.space import UNDELAYED
+from sb3_said.sac.scaling import ReturnScale, StateNormalizer
+
+AS_SADR = {
+    "scale_rewards": False,
+    "normalise_states": False,
+    "policy_delay": 1,
+    "ent_coef": "auto",
+    "target_entropy": "auto",
+}
+
+
+make = partial(make_agent, cls=StableSAC)
+
+
+def with_rewards(reward):
+    """Return the small task with another reward a step."""
+    return gym.wrappers.TransformReward(Drift(), lambda _: reward)
+
+
+# ----------------------------------------------------------------------------------------------------------- scales
+
+
+@given(st.lists(arrays(np.float64, 3, elements=st.floats(-1e3, 1e3)), min_size=1, max_size=8))
+def test_the_scale_of_returns(batches):
+    scale, expected = ReturnScale(), RunningMeanStd(shape=())
+    for returns in batches:
+        scale.update(returns)
+        expected.update(returns)
+    np.testing.assert_allclose([scale.mean, scale.variance, scale.count], [expected.mean, expected.var, expected.count])
+    largest = np.abs(batches).max()
+    np.testing.assert_allclose(scale.value, max(np.sqrt(expected.var), largest / 5))
+    assert largest / scale.value <= 5 + 1e-9
+
+
+def test_before_the_first_return_nothing_is_scaled():
+    assert ReturnScale().value == 1.0
+    states = th.randn(4, 3)
+    assert th.equal(StateNormalizer(3)(states), states)
+
+
+def test_states_are_scored():
+    normalizer, states = StateNormalizer(3), th.randn(500, 3) * th.tensor([1.0, 50.0, 0.0]) + th.tensor([0.0, 7.0, 2.0])
+    normalizer.fit(states, 500)
+    scores = normalizer(states)
+    np.testing.assert_allclose(scores.mean(0), 0.0, atol=1e-4)
+    np.testing.assert_allclose(scores.std(0, correction=0), [1, 1, 0], atol=1e-3)
+    assert normalizer(th.full((1, 3), 1e6)).max() == 10  # an entry that never moved, and then does
+
+
+# --------------------------------------------------------------------------------------------------------- learning
+
+
+def test_the_running_return_is_that_of_each_episode():
+    model = make(make_vec_env(Drift, n_envs=2), gamma=0.5, learning_starts=100).learn(72)  # three episodes of 12 each
+    returns = np.cumsum(0.5 ** np.arange(12))  # of a reward of 1 a step
+    scale = model.policy.return_scale
+    np.testing.assert_allclose([scale.mean, scale.count, scale.largest], [returns.mean(), 72, 2], rtol=1e-3)
+
+
+@pytest.mark.parametrize("task", ["plain", "delayed"])
+@pytest.mark.parametrize("reward", [1.0, 300.0])
+def test_values_are_in_the_units_of_rewards(task, reward):
+    """A reward that goes on for ever is worth r / (1 - gamma), whatever its size; the critics hold it scaled."""
+    env = with_rewards(reward)
+    if task == "delayed":
+        env = delayed(2)
+        env.env = with_rewards(reward)
+    model = make(env, cls=SAID, gamma=0.8, ent_coef=0.0, tau=0.1, learning_rate=1e-2, batch_size=64).learn(300)
+    batch = model.replay_buffer.sample(200)
+    states = batch.observations[UNDELAYED] if task == "delayed" else batch.observations
+    with th.no_grad():
+        held = th.cat(model.critic(batch.observations, batch.actions), dim=1)
+        values = model.policy.q_value(states, batch.actions)
+    np.testing.assert_allclose(values, reward / (1 - 0.8), rtol=0.1)
+    assert held.max() < 10  # the largest return of an episode is 5
+    assert model._stored_values(states, batch.actions).shape == values.shape
+
+
+def test_what_actor_and_critics_read_of_states():
+    model = make(delayed(3)).learn(60)
+    normalizer, batch = model.policy.state_normalizer, model.replay_buffer.sample(8).observations
+    actor, critic = model.actor.features_extractor(batch), model.critic.features_extractor(batch)
+    assert normalizer.fitted_at > 50
+    th.testing.assert_close(actor[:, :2], (batch["observation"] - normalizer.mean) / normalizer.deviation)
+    th.testing.assert_close(critic, (batch[UNDELAYED] - normalizer.mean) / normalizer.deviation)
+    seen = model.replay_buffer.observations[: model.replay_buffer.size()].reshape(-1, 2)
+    np.testing.assert_allclose(normalizer.mean, seen.mean(0), atol=0.05)
+    th.testing.assert_close(actor[:, -1:], batch["delay"] / 3)  # ages and actions as they are
+
+
+def test_one_update_is_that_of_the_formulas():
+    model = make(learning_starts=1000).learn(50)
+    model.policy.state_normalizer.fit(th.randn(100, 2) * 3, 10**9)  # not looked at again
+    model.policy.return_scale.update(np.full(50, 40.0))
+    batch, scale = model.replay_buffer.sample(16), model.policy.return_scale.value
+    model.replay_buffer.sample = lambda *_, **__: batch
+    critic, actor = model.critic, model.actor
+    before = [parameter.clone() for parameter in actor.parameters()]
+
+    th.manual_seed(1)
+    with th.no_grad():
+        action, log_prob = actor.action_log_prob(batch.next_observations)
+        value = th.min(*model.critic_target(batch.next_observations, action)).squeeze(1) - 0.01 * log_prob
+        target = batch.rewards.squeeze(1) / scale + model.gamma * (1 - batch.dones.squeeze(1)) * value
+    first, second = critic(batch.observations, batch.actions)
+    loss = 0.5 * F.mse_loss(first.squeeze(1), target) + 0.5 * F.mse_loss(second.squeeze(1), target)
+    expected = th.autograd.grad(loss, list(critic.parameters()))
+
+    th.manual_seed(1)
+    model.train(1, 16)
+    for parameter, gradient in zip(critic.parameters(), expected, strict=True):
+        th.testing.assert_close(parameter.grad, gradient)
+    assert all(map(th.equal, before, actor.parameters()))  # its turn is the next
+
+    assert model.log_ent_coef.exp().item() == pytest.approx(0.01)
+    model.train(1, 16)
+    assert not any(map(th.equal, before, actor.parameters()))
+    assert model.log_ent_coef.exp().item() != pytest.approx(0.01, rel=1e-6)
+
+
+def test_the_actor_is_slower():
+    model, changes, before = make(policy_delay=3, learning_starts=1000).learn(40), [], None
+    for _ in range(12):
+        model.train(1, 16)
+        now = model.actor.mu.weight.detach().clone()
+        changes.append(before is not None and not th.equal(now, before))
+        before = now
+    assert changes == [False, False, True] * 4
+
+
+def test_without_its_parts_it_learns_as_delayed_sac():
+    """But for the order of an update: so values agree, and no number does exactly."""
+    kwargs = {"gamma": 0.8, "tau": 0.1, "learning_rate": 1e-2, "batch_size": 64}
+    values = []
+    for model in (make(**AS_SADR, **kwargs).learn(250), make(cls=DelayedSAC, **kwargs).learn(250)):
+        batch = model.replay_buffer.sample(200)
+        with th.no_grad():
+            values.append(float(th.cat(model.critic(batch.observations, batch.actions)).mean()))
+        assert model.policy.state_dict().keys() == make(cls=DelayedSAC).policy.state_dict().keys()
+    assert values[0] == pytest.approx(values[1], rel=0.1)
+
+
+def test_it_learns_to_be_where_rewards_are():
+    class Near(Drift):
+        def step(self, action):
+            state, _, *rest = super().step(action)
+            return state, -float((state[0] - 0.5) ** 2), *rest
+
+    env = delayed(2)
+    env.env = Near(length=25)
+    model = make(env, gamma=0.9, learning_rate=3e-3, batch_size=64, buffer_size=1500, learning_starts=100).learn(700)
+    obs, _ = env.reset(seed=5)
+    states = []
+    for _ in range(25):
+        obs, *_, info = env.step(model.predict(obs, deterministic=True)[0])
+        states.append(info["undelayed_observation"][0])
+    assert np.mean(states[-8:]) == pytest.approx(0.5, abs=0.25)
+
+
+# ------------------------------------------------------------------------------------------------------------ files
+
+
+def test_scales_are_part_of_the_agent(tmp_path):
+    model = make(delayed(3)).learn(60)
+    model.save(tmp_path / "agent.zip")
+    loaded = StableSAC.load(tmp_path / "agent.zip", device="cpu")
+    assert loaded.policy.return_scale.value == model.policy.return_scale.value != 1
+    th.testing.assert_close(loaded.policy.state_dict(), model.policy.state_dict(), rtol=0, atol=0)
+    obs, _ = delayed(3).reset(seed=0)
+    np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
+    assert loaded.target_entropy == model.target_entropy == -0.5
+
+
+def test_beside_vec_normalize():
+    env = VecNormalize(make_vec_env(lambda: with_rewards(7.0), 2), gamma=0.8)
+    model = make(env, cls=SAID, gamma=0.8, ent_coef=0.0, tau=0.1, learning_rate=1e-2, batch_size=64).learn(400)
+    batch = model.replay_buffer.sample(100, env=env)
+    values = model._stored_values(batch.observations, batch.actions)  # in the task's own rewards
+    np.testing.assert_allclose(values, 7 / (1 - 0.8), rtol=0.15)
+
+
+def test_a_policy_delay_below_one():
+    with pytest.raises(ValueError, match="policy_delay must be at least 1, got 0"):
+        make(policy_delay=0)
