@@ -1,7 +1,7 @@
 """How good and how fast an agent is: whole seeded episodes, intervals, decision latencies, plots."""
 
 from sb3_said.evaluation.rollout import Rollout, collect_observations, measure_latency, rollout
-from sb3_said.evaluation.statistics import Interval, Latency, Summary, confidence_interval, iqm
+from sb3_said.evaluation.statistics import Interval, Latency, Summary, confidence_interval, iqm, worst_tenth
 
 __all__ = [
     "Interval",
@@ -13,4 +13,5 @@ __all__ = [
     "iqm",
     "measure_latency",
     "rollout",
+    "worst_tenth",
 ]

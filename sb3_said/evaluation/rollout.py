@@ -28,6 +28,10 @@ class Rollout:
     """(n_episodes,) float64, sum of the environment's own rewards, in the order of the reset seeds"""
     lengths: np.ndarray
     """(n_episodes,) int64, in control steps"""
+    terminated: np.ndarray
+    """(n_episodes,) bool, whether the task ended the episode (in MuJoCo's, by a fall), and no time limit"""
+    action_changes: np.ndarray
+    """(n_episodes,) float64, mean |a_t - a_{t-1}| over steps and entries, in halves of the action space's range"""
     call_seconds: np.ndarray
     """(n_calls,) float64, wall time of each call of ``predict``"""
     batch_sizes: np.ndarray
@@ -66,9 +70,12 @@ def rollout(
     if n_episodes < 1 or n_envs < 1:
         raise ValueError(f"n_episodes and n_envs must be at least 1, got n_episodes={n_episodes}, n_envs={n_envs}.")
     returns, lengths = np.zeros(n_episodes), np.zeros(n_episodes, np.int64)
+    ended, changes = np.zeros(n_episodes, bool), np.zeros(n_episodes)
+    before: dict[int, np.ndarray] = {}  # the last action of each episode that is played
     call_seconds: list[float] = []
     batch_sizes: list[int] = []
     envs = [_make(env) for _ in range(min(n_envs, n_episodes))]
+    half_range = _half_range(envs[0].action_space)
     try:
         playing = [(e, episode, e.reset(seed=seed + episode)[0]) for episode, e in enumerate(envs)]
         next_episode = len(playing)
@@ -88,6 +95,9 @@ def rollout(
                 observation, reward, terminated, truncated, _ = e.step(actions[row])
                 returns[episode] += float(reward)
                 lengths[episode] += 1
+                ended[episode] = terminated
+                changes[episode] += np.mean(np.abs(actions[row] - before.get(episode, actions[row])) / half_range)
+                before[episode] = actions[row]
                 if on_step is not None:
                     on_step(e)
                 if terminated or truncated:
@@ -104,7 +114,8 @@ def rollout(
     finally:
         for e in envs:
             e.close()
-    return Rollout(returns, lengths, np.array(call_seconds), np.array(batch_sizes, np.int64))
+    changes /= np.maximum(lengths - 1, 1)
+    return Rollout(returns, lengths, ended, changes, np.array(call_seconds), np.array(batch_sizes, np.int64))
 
 
 def collect_observations(env: EnvMaker, n_observations: int, seed: int) -> Observation:
@@ -170,6 +181,14 @@ def measure_latency(
 
 def _make(env: EnvMaker) -> gym.Env[Any, Any]:
     return gym.make(env) if isinstance(env, str) else env()
+
+
+def _half_range(space: gym.Space[Any]) -> np.ndarray:
+    """Return half the distance of a Box's bounds, and 1 where an action has none."""
+    if not isinstance(space, gym.spaces.Box):
+        return np.ones(())
+    half = space.high.astype(np.float64) / 2 - space.low.astype(np.float64) / 2
+    return np.where(np.isfinite(half), half, 1.0)
 
 
 def _row(observations: Observation, row: int) -> Observation:

@@ -72,10 +72,22 @@ class Summary:
     latency: Latency | None
     returns: list[float]
     lengths: list[int]
+    worst_tenth: float
+    """mean of the lowest tenth of the returns, of at least one"""
+    terminations: int | None = None
+    """episodes that the task ended (in MuJoCo's, by a fall), and no time limit"""
+    mean_action_change: Interval | None = None
+    """mean |a_t - a_{t-1}| in halves of the action space's range: how rough the motion is"""
 
     @classmethod
     def from_episodes(
-        cls, label: str, returns: npt.ArrayLike, lengths: npt.ArrayLike, latency: Latency | None = None
+        cls,
+        label: str,
+        returns: npt.ArrayLike,
+        lengths: npt.ArrayLike,
+        latency: Latency | None = None,
+        terminated: npt.ArrayLike | None = None,
+        action_changes: npt.ArrayLike | None = None,
     ) -> Summary:
         """Summarise whole episodes.
 
@@ -83,6 +95,8 @@ class Summary:
         :param returns: (n_episodes,)
         :param lengths: (n_episodes,), in control steps
         :param latency: of single decisions, if it was measured
+        :param terminated: (n_episodes,) bool, if it is known
+        :param action_changes: (n_episodes,), if they were measured
         """
         return cls(
             label=label,
@@ -91,6 +105,9 @@ class Summary:
             latency=latency,
             returns=[float(x) for x in np.asarray(returns)],
             lengths=[int(x) for x in np.asarray(lengths)],
+            worst_tenth=worst_tenth(returns),
+            terminations=None if terminated is None else int(np.sum(terminated)),
+            mean_action_change=None if action_changes is None else confidence_interval(action_changes),
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -105,6 +122,15 @@ def iqm(values: np.ndarray, axis: int = -1) -> np.ndarray:
     :param axis: to reduce
     """
     return np.asarray(trim_mean(values, 0.25, axis=axis))
+
+
+def worst_tenth(returns: npt.ArrayLike) -> float:
+    """Return the mean of the lowest tenth of returns, rounded up to at least one.
+
+    :param returns: (n_episodes,), or (n_seeds, n_episodes), of which all count alike
+    """
+    ordered = np.sort(np.asarray(returns, dtype=np.float64), axis=None)
+    return float(ordered[: math.ceil(len(ordered) / 10)].mean())
 
 
 def confidence_interval(

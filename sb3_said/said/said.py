@@ -36,10 +36,11 @@ SelfSAID = TypeVar("SelfSAID", bound="SAID")
 class SAID(OfflineAlgorithm, StableSAC):
     """State-Action Inpainting Diffuser, online (paper, Algorithm 1) and offline (Algorithm 2).
 
-    ``learn`` runs the expert (:class:`~sb3_said.sac.StableSAC`), then trains a diffusion transformer on windows of its replay buffer. ``predict``
-    asks the expert until the planner is trained, and then whoever of the two does better in a few episodes. The planner
-    inpaints what the delay hides and the plan behind it; at a temperature above 0 many times, and the critics choose.
-    Collection always uses the expert. ``learn_offline`` trains the planner on logs instead, without an expert.
+    ``learn`` runs the expert (:class:`~sb3_said.sac.StableSAC`), then trains a diffusion transformer on windows of its
+    replay buffer. ``predict`` asks the expert until the planner is trained, and then whoever of the two does better in
+    a few episodes. The planner inpaints what the delay hides and the plan behind it; at a temperature above 0 many
+    times, and the critics choose. Collection always uses the expert. ``learn_offline`` trains the planner on logs
+    instead, without an expert.
 
     :param policy: ``"MultiInputPolicy"`` or ``"MlpPolicy"``, which name the same class
     :param env: a task in a ``DelayedObservationWrapper``, or one with a 1-D Box observation (delay 0)

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 
 from sb3_said.delays.text import make_process
-from sb3_said.evaluation import confidence_interval
+from sb3_said.evaluation import confidence_interval, worst_tenth
 from sb3_said.files.atomic import write_json
 
-#: Returns by row and delay: (n_episodes,), or (n_seeds, n_episodes) of several training seeds.
+AGE = ", age "  # in the name of a column, before the error
+#: Returns by row and column: (n_episodes,), or (n_seeds, n_episodes) of several training seeds.
 Table = dict[str, dict[int | str, np.ndarray]]
 
 
@@ -38,11 +39,18 @@ class Cell:
     """which of the file's origins made the result"""
     result: dict[str, Any] | None = None
     """a summary without its label, which the cell has"""
+    age_error: int = 0
+    """control steps that the age is told wrong by, cut at 0 and at the largest that the agent was built for"""
 
     @property
     def key(self) -> tuple[str, ...]:
-        """The file's contents, the answer and the delay: equal keys have equal results."""
-        return self.sha256, str(self.answer), repr(make_process(self.delay))
+        """The file's contents, the answer, the delay and the error: equal keys have equal results."""
+        return self.sha256, str(self.answer), repr(make_process(self.delay)), str(self.age_error)
+
+    @property
+    def column(self) -> int | str:
+        """What the table shows it under: its delay, and how wrong the age is told."""
+        return f"{self.delay}{AGE}{self.age_error:+d}" if self.age_error else self.delay
 
 
 class Results:
@@ -90,21 +98,41 @@ def make_table(cells: list[Cell], rows: Mapping[str, str]) -> Table:
     played: dict[str, dict[int | str, list[list[float]]]] = {agent: {} for agent in rows}
     for cell in cells:
         if cell.agent in played and (result := cell.result) is not None:
-            played[cell.agent].setdefault(cell.delay, []).append(result["returns"])
+            played[cell.agent].setdefault(cell.column, []).append(result["returns"])
     return {
         rows[agent]: {delay: np.array(seeds if len(seeds) > 1 else seeds[0]) for delay, seeds in row.items()}
         for agent, row in played.items()
     }
 
 
+def print_manners(cells: list[Cell], rows: Mapping[str, str]) -> None:
+    """Print how each row's agent moves, over all that it played with the age told right.
+
+    :param rows: as of :func:`make_table`
+    """
+    for agent, name in rows.items():
+        played = [cell.result for cell in cells if cell.agent == agent and cell.result and not cell.age_error]
+        returns = [x for result in played for x in result["returns"]]
+        ended = [x for result in played if (x := result.get("terminations")) is not None]
+        changes = [x["value"] for result in played if (x := result.get("mean_action_change"))]
+        if played:
+            words = [f"{name}: worst tenth of returns {worst_tenth(returns):.1f}"]
+            if ended:
+                words.append(f"{sum(ended) / len(returns):.0%} of the episodes ended by the task")
+            if changes:
+                words.append(f"actions change by {np.mean(changes):.3f} a step")
+            print(", ".join(words))
+
+
 def print_table(table: Table, delays: list[int | str]) -> None:
     """Print a Markdown table: one row for each agent, one column for each delay, then the averages.
 
-    A line below it says what the intervals are over.
+    Ages that are told wrong have columns of their own and count in no average. A line below it says what the intervals
+    are over.
     """
     columns: dict[str, list[int | str]] = {str(delay): [delay] for delay in delays}
     for name, kind in (("mean of fixed", int), ("mean of random", str)):
-        columns[name] = [delay for delay in delays if isinstance(delay, kind)]
+        columns[name] = [delay for delay in delays if isinstance(delay, kind) and AGE not in str(delay)]
     averages = {agent: [average(row, column) for column in columns.values()] for agent, row in table.items()}
     rows = [["return under delay", *columns]]
     rows += [[agent, *(text for text, _ in row)] for agent, row in averages.items()]

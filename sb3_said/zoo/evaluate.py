@@ -83,7 +83,8 @@ def evaluate(
         if latency_calls > 0:
             observations = collect_observations(run.make_env, min(latency_calls, 100), seed)
             latency = measure_latency(run.model, observations, latency_calls, deterministic, run.normalize)
-    return Summary.from_episodes(label, played.returns, played.lengths, latency)
+    measured = played.terminated, played.action_changes
+    return Summary.from_episodes(label, played.returns, played.lengths, latency, *measured)
 
 
 def print_table(summaries: list[Summary]) -> None:

@@ -21,7 +21,7 @@ from sb3_said.delays import FixedDelay
 from sb3_said.delays.text import age_range, make_process
 from sb3_said.evaluation import Summary, plots
 from sb3_said.zoo.arguments import TRUST, add_playing, check_positive, explained, largest_delay, make_parser, read_delay
-from sb3_said.zoo.cells import Cell, Results, make_table, print_table
+from sb3_said.zoo.cells import Cell, Results, make_table, print_manners, print_table
 from sb3_said.zoo.runs import ANSWERS, LoadedRun, answering, answers, delay_name, load_run, longest_delay, origin
 
 EPILOG = f"""\
@@ -58,6 +58,8 @@ def main(argv: list[str] | None = None) -> None:
                         "without any, the contents of --json are shown")  # fmt: skip
     parser.add_argument("--delays", nargs="+", metavar="DELAY", help="each a number of control steps, or a process of "
                         "docs/delays.md in quotes, such as 'DroppedPackets(4, p=0.1)'")  # fmt: skip
+    parser.add_argument("--age-errors", type=int, nargs="+", default=[], metavar="STEPS", help="play each delay also "
+                        "with the age told wrong by so many steps, such as -2 -1 1 2")  # fmt: skip
     parser.add_argument("--answer", choices=ANSWERS, help="who acts in SAID agents (default: both, as two rows)")
     parser.add_argument("--json", type=Path, required=True, help="file of the numbers, read and written")
     parser.add_argument("--plot", type=Path, help="draw return over delay to this .png or .pdf")
@@ -77,7 +79,10 @@ def main(argv: list[str] | None = None) -> None:
         shown = play_missing(args, delays) if args.runs else known_cells(args.json, delays)
         rows = choose_rows(args.rows, shown)
     table = make_table(shown, rows)
-    print_table(table, delays or list(dict.fromkeys(cell.delay for cell in shown)))
+    order = delays or list(dict.fromkeys(cell.delay for cell in shown))
+    in_order = sorted(shown, key=lambda cell: (cell.age_error != 0, order.index(cell.delay), cell.age_error))
+    print_table(table, list(dict.fromkeys(cell.column for cell in in_order)))
+    print_manners(shown, rows)
     if args.plot is not None and any(table.values()):
         settings = Results(args.json).settings
         title = f"{settings['env']} under delay: means of {settings['n_episodes']} episodes, 95 % intervals"
@@ -143,13 +148,15 @@ def play_missing(args: argparse.Namespace, delays: list[int | str]) -> list[Cell
     settings = {"env": first.info["env"], "n_episodes": args.episodes, "seed": args.seed, "deterministic": True}
     results = Results(args.json, settings)
     cells = [cell for label, row in runs.items() for cell in cells_of(label, row, delays, args.answer)]
+    errors = [0, *(error for error in dict.fromkeys(args.age_errors) if error)]
+    cells = [replace(cell, age_error=error) for error in errors for cell in cells]
     choose_rows(args.rows, cells)
     results.ask(cells)
     todo = [cell for cell in cells if cell.result is None and cell.obstacle is None]
     print_settings(settings)
     for cell in cells:
         if cell.obstacle is not None:
-            print(f"{cell.agent} cannot play delay {cell.delay}: {cell.obstacle}.")
+            print(f"{cell.agent} cannot play delay {cell.column}: {cell.obstacle}.")
     print(f"{len(todo)} of {len(cells)} cells to play")
     if todo:
         results.origins.append(origin(first))
@@ -157,7 +164,7 @@ def play_missing(args: argparse.Namespace, delays: list[int | str]) -> list[Cell
         cell.origin, cell.result = len(results.origins) - 1, summary.to_dict()
         del cell.result["label"]  # another call can give the agent another one
         results.write()
-        print(f"{done}/{len(todo)} {cell.agent}, delay {cell.delay}: {summary.mean_return}", flush=True)
+        print(f"{done}/{len(todo)} {cell.agent}, delay {cell.column}: {summary.mean_return}", flush=True)
     results.write()
     print(f"Wrote {args.json}")
     return cells
@@ -269,5 +276,6 @@ def play(
     with at_any_age():
         run = load_run(cell.file, cell.algo, env_id, cell.delay, device, gym_packages=gym_packages)
         with answering(run.model, cell.answer):
-            played = run.play(episodes, seed, n_envs)
-    return Summary.from_episodes(cell.agent, played.returns, played.lengths)
+            played = run.play(episodes, seed, n_envs, age_error=cell.age_error)
+    measured = played.terminated, played.action_changes
+    return Summary.from_episodes(cell.agent, played.returns, played.lengths, None, *measured)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import gymnasium as gym
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -48,9 +49,20 @@ class LoadedRun:
     info: dict[str, Any]
     """what was loaded, in JSON types: algo, env, delay, file, trained_steps"""
 
-    def play(self, n_episodes: int, seed: int, n_envs: int = 1, **kwargs: Any) -> Rollout:
-        """Play whole episodes, see :func:`~sb3_said.evaluation.rollout`."""
-        return rollout(self.model, self.make_env, n_episodes, seed, n_envs, normalize=self.normalize, **kwargs)
+    def play(self, n_episodes: int, seed: int, n_envs: int = 1, age_error: int = 0, **kwargs: Any) -> Rollout:
+        """Play whole episodes, see :func:`~sb3_said.evaluation.rollout`.
+
+        :param age_error: control steps that the age is told wrong by, within what the agent was built for
+        """
+        max_delay = longest_delay(self.model) or 0
+
+        def read(observation: Observation) -> Observation:
+            if age_error:
+                age = np.clip(observation["delay"] + age_error, 0, max_delay)
+                observation = {**observation, "delay": age.astype(np.float32)}
+            return observation if self.normalize is None else self.normalize(observation)
+
+        return rollout(self.model, self.make_env, n_episodes, seed, n_envs, normalize=read, **kwargs)
 
 
 def load_run(

@@ -96,6 +96,33 @@ def test_returns_are_those_of_a_loop_by_hand_whatever_the_number_of_environments
     assert result.call_seconds.shape == result.batch_sizes.shape and np.all(result.call_seconds > 0)
 
 
+class Waves(Countdown):
+    """Five steps; the third entry of the answer is what the task makes of an end."""
+
+    def __init__(self, falls: bool) -> None:
+        super().__init__()
+        self.action_space = gym.spaces.Box(np.array([-2, 0], np.float32), np.array([2, 10], np.float32))
+        self.falls, self.t = falls, 0
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self.t += 1
+        return self._observe(), 0.0, self.falls and self.t == 5, self.t == 5, {}
+
+
+@pytest.mark.parametrize("falls", [True, False])
+def test_falls_and_rough_actions(falls: bool) -> None:
+    class Alternates:
+        t = 0
+
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            self.t += 1
+            return np.tile([[(-1.0) ** self.t, 5.0 + self.t]], (len(observation), 1)), None
+
+    result = rollout(Alternates(), lambda: Waves(falls), 3, SEED, n_envs=3)
+    assert result.terminated.tolist() == [falls] * 3
+    np.testing.assert_allclose(result.action_changes, (2 / 2 + 1 / 5) / 2)  # of half ranges 2 and 5
+
+
 def test_environments_that_are_done_leave_the_batch() -> None:
     model = Model()
     result = rollout(model, Countdown, 4, SEED, n_envs=4)

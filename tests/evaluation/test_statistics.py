@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import ttest_1samp
 
-from sb3_said.evaluation import Latency, Summary, confidence_interval, iqm
+from sb3_said.evaluation import Latency, Summary, confidence_interval, iqm, worst_tenth
 
 
 @pytest.mark.parametrize("statistic", [np.mean, np.median, iqm])
@@ -164,3 +164,9 @@ def test_summary_is_strict_json() -> None:
         "method": "none",
     }
     assert read["returns"] == [5.0] and read["lengths"] == [7] and read["latency"]["n_calls"] == 1
+
+
+def test_the_worst_tenth() -> None:
+    assert worst_tenth([5.0]) == 5.0
+    assert worst_tenth(np.arange(20.0)[::-1]) == 0.5
+    assert worst_tenth(np.arange(22.0).reshape(2, 11)) == 1.0

@@ -6,7 +6,7 @@ import json
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -313,3 +313,32 @@ def test_runs_of_two_tasks_are_refused(sadr: Path, tmp_path: Path, capsys: pytes
     with pytest.raises(SystemExit):
         play(tmp_path / "out.json", [sadr, other], ["0"])
     assert "several tasks cannot be compared" in capsys.readouterr().err
+
+
+def test_an_age_that_is_told_wrong(said: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    play(tmp_path / "out.json", [f"any={said}"], ["1"], "--answer", "expert")
+    document = play(tmp_path / "out.json", [f"any={said}"], ["1"], "--answer", "expert", "--age-errors", "-2", "1")
+    cells = {cell["age_error"]: cell["result"] for cell in document["cells"]}
+    assert [*cells] == [0, -2, 1]
+    assert cells[-2]["returns"] != cells[0]["returns"] != cells[1]["returns"]
+    out = capsys.readouterr().out
+    assert "2 of 3 cells to play" in out and "| 1, age -2" in out and "| 1, age +1" in out
+    assert f"any expert: worst tenth of returns {min(cells[0]['returns']):.1f}" in out
+
+    class Ages:
+        """Notes the ages that it is told, and acts at random."""
+
+        told: ClassVar[list[float]] = []
+
+        def __init__(self, model):
+            self.observation_space, self.action_space = model.observation_space, model.action_space
+
+        def predict(self, observation, **_):
+            self.told += observation["delay"].ravel().tolist()
+            return np.zeros((len(observation["delay"]), *self.action_space.shape), np.float32), None
+
+    run = load_run(said, delay=1)
+    for error, expected in ((0, [0, 1, 1]), (-2, [0, 0, 0]), (1, [1, 2, 2]), (5, [2, 2, 2])):
+        Ages.told.clear()
+        replace(run, model=Ages(run.model)).play(1, 0, age_error=error)
+        assert Ages.told[:3] == expected
