@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -31,6 +33,7 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         reads
     :param normalise_states: both read z-scores of states (see :class:`~sb3_said.sac.scaling.StateNormalizer`)
     :param scale_rewards: the critics' values are in units of a :class:`~sb3_said.sac.scaling.ReturnScale`
+    :param average_actor: an average of the actor's weights answers, see :meth:`without_average`
     :param policy_kwargs: of ``SACPolicy``
     :raises ValueError: for other spaces, or when a features extractor is given or shared in a delayed task
     """
@@ -45,6 +48,7 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         delay_reconciled_critic: bool = True,
         normalise_states: bool = False,
         scale_rewards: bool = False,
+        average_actor: bool = False,
         **policy_kwargs: Any,
     ):
         state_space, self.max_delay = check_spaces(observation_space, action_space)
@@ -52,6 +56,7 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         self.delay_reconciled_critic = delay_reconciled_critic
         self.normalise_states = normalise_states
         self.scale_rewards = scale_rewards
+        self.average_actor = average_actor
         self.replay_space: spaces.Dict | None = None
         if isinstance(observation_space, spaces.Dict):
             is_shared = policy_kwargs.get("share_features_extractor", False)
@@ -70,6 +75,26 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
             state_space, _ = check_spaces(self.observation_space, self.action_space)
             self.state_normalizer = StateNormalizer(state_space.shape[0])
         super()._build(lr_schedule)
+        self.averaged_actor: Actor | None = None
+        if self.average_actor:
+            self.averaged_actor = self.make_actor().requires_grad_(False)
+            self.averaged_actor.load_state_dict(self.actor.state_dict())
+            self.averaged_actor.set_training_mode(False)
+        self._answers_as_average = self.average_actor
+
+    @contextmanager
+    def without_average(self) -> Iterator[None]:
+        """Let the actor that learns answer ``predict`` for a while, where its average would."""
+        before, self._answers_as_average = self._answers_as_average, False
+        try:
+            yield
+        finally:
+            self._answers_as_average = before
+
+    def reset_noise(self, batch_size: int = 1) -> None:
+        super().reset_noise(batch_size)
+        if self.averaged_actor is not None:
+            self.averaged_actor.reset_noise(batch_size)
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         return super().make_actor(features_extractor or self._extractor(self.actor_kwargs, "observation"))
@@ -143,8 +168,10 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         return np.clip(actions, space.low, space.high), state  # scaling to the bounds may round to beyond them
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        actor = self.averaged_actor if self._answers_as_average else self.actor
+        assert actor is not None
         try:
-            return super()._predict(observation, deterministic)
+            return actor(observation, deterministic)
         except ValueError as error:  # of torch's distributions, about a NaN
             raise ValueError(NOT_FINITE) from error
 
@@ -155,6 +182,7 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
             "delay_reconciled_critic": self.delay_reconciled_critic,
             "normalise_states": self.normalise_states,
             "scale_rewards": self.scale_rewards,
+            "average_actor": self.average_actor,
         }
 
 

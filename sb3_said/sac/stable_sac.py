@@ -8,7 +8,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
-from stable_baselines3.common.utils import polyak_update
+from stable_baselines3.common.utils import get_parameters_by_name, polyak_update
 
 from sb3_said.delays.space import UNDELAYED
 from sb3_said.sac.delayed_sac import DelayedSAC
@@ -21,16 +21,18 @@ STATES_LOOKED_AT = 10_000
 class StableSAC(DelayedSAC):
     """:class:`DelayedSAC` whose returns rise and stay: what the field has found since SAC, as far as it helps here.
 
-    Four parts, measured in results/stable_expert.md:
+    Five parts, measured in results/stable_expert.md:
 
     - rewards are divided by the size of the returns so far (SimbaV2, https://arxiv.org/abs/2502.15280, section 4.4), so
       that the critics' units stay the same while the policy improves;
     - states are z-scored, with the statistics of replay; actions and ages are in [-1, 1] as they are;
     - in those units the entropy coefficient starts at 0.01, and the target is half of SAC's;
-    - actor and entropy coefficient are updated every second step (TD3, https://arxiv.org/abs/1802.09477, section 5.2).
+    - actor and entropy coefficient are updated every second step (TD3, https://arxiv.org/abs/1802.09477, section 5.2);
+    - a running average of the actor's weights answers ``predict``, and is saved with it, while the actor itself
+      collects: one gradient step can move a return far (https://arxiv.org/abs/2309.14597), thousands of them less.
 
-    With ``scale_rewards=False, normalise_states=False, policy_delay=1, ent_coef="auto", target_entropy="auto"`` it is
-    ``DelayedSAC``, but for the order of an update, where the critics come first.
+    With ``scale_rewards=False, normalise_states=False, policy_delay=1, actor_averaging=0.0, ent_coef="auto",
+    target_entropy="auto"`` it is ``DelayedSAC``, but for the order of an update, where the critics come first.
 
     :param policy: ``"MultiInputPolicy"`` or ``"MlpPolicy"``, which name the same class
     :param env: a task in a ``DelayedObservationWrapper``, or one with a 1-D Box observation (delay 0)
@@ -38,10 +40,11 @@ class StableSAC(DelayedSAC):
     :param scale_rewards: learn from rewards divided by :class:`~sb3_said.sac.scaling.ReturnScale`
     :param normalise_states: actor and critics read z-scores of states
     :param policy_delay: updates of the critics for each of the actor
+    :param actor_averaging: decay of the actor's average in each of its updates, in [0, 1); 0 for no average
     :param ent_coef: SAC's, in units of scaled rewards
     :param target_entropy: SAC's; ``"half"`` is -act_dim / 2, ``"auto"`` is -act_dim
     :param sac_kwargs: every other argument of :class:`DelayedSAC`
-    :raises ValueError: as ``DelayedSAC`` does, and for a ``policy_delay`` below 1
+    :raises ValueError: as ``DelayedSAC`` does, and for a ``policy_delay`` or an ``actor_averaging`` out of range
     """
 
     policy: DelayedSACPolicy
@@ -55,31 +58,47 @@ class StableSAC(DelayedSAC):
         scale_rewards: bool = True,
         normalise_states: bool = True,
         policy_delay: int = 2,
+        actor_averaging: float = 0.9998,
         ent_coef: str | float = "auto_0.01",
         target_entropy: str | float = "half",
         **sac_kwargs: Any,
     ):
         if policy_delay < 1:
             raise ValueError(f"policy_delay must be at least 1, got {policy_delay}.")
+        if not 0.0 <= actor_averaging < 1.0:
+            raise ValueError(f"actor_averaging is a decay in [0, 1), got {actor_averaging}.")
         self.scale_rewards = scale_rewards
         self.normalise_states = normalise_states
         self.policy_delay = policy_delay
+        self.actor_averaging = actor_averaging
         self._running_returns = np.zeros(1)  # (n_envs,) G_t of the episodes that are being played
         super().__init__(policy, env, learning_rate, ent_coef=ent_coef, target_entropy=target_entropy, **sac_kwargs)
 
     def _setup_model(self) -> None:
         if self.target_entropy == "half":
             self.target_entropy = -0.5 * float(np.prod(self.action_space.shape or ()))
+        given = self.policy_kwargs
+        if not {"optimizer_class", "optimizer_kwargs"} & set(given):
+            self.policy_kwargs = {**given, "optimizer_kwargs": {"fused": True}}  # Adam: a tenth of an update
         super()._setup_model()
+        self.policy_kwargs = given
 
     def _policy_flags(self) -> dict[str, Any]:
-        flags = {"normalise_states": self.normalise_states, "scale_rewards": self.scale_rewards}
-        return {**super()._policy_flags(), **flags}
+        return {
+            **super()._policy_flags(),
+            "normalise_states": self.normalise_states,
+            "scale_rewards": self.scale_rewards,
+            "average_actor": self.actor_averaging > 0.0,
+        }
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         learn = super()._setup_learn(*args, **kwargs)
         self._running_returns = np.zeros(self.n_envs)
         return learn
+
+    def _sample_action(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, np.ndarray]:
+        with self.policy.without_average():
+            return super()._sample_action(*args, **kwargs)
 
     def _store_transition(
         self,
@@ -102,6 +121,17 @@ class StableSAC(DelayedSAC):
         if normalizer is not None and self.num_timesteps >= REFIT_GROWTH * float(normalizer.fitted_at):
             seen = self.replay_buffer.sample(STATES_LOOKED_AT, env=self._vec_normalize_env).observations
             normalizer.fit(seen[UNDELAYED] if isinstance(seen, dict) else seen, self.num_timesteps)
+
+    def _average_actor(self) -> None:
+        """Move the average towards the actor; of the first updates it is the plain mean."""
+        if self.policy.averaged_actor is not None:
+            n = self._n_updates // self.policy_delay
+            decay = min(self.actor_averaging, 1.0 - 1.0 / n)
+            polyak_update(self.actor.parameters(), self.policy.averaged_actor.parameters(), 1.0 - decay)
+            running = [
+                get_parameters_by_name(actor, ["running_"]) for actor in (self.actor, self.policy.averaged_actor)
+            ]
+            polyak_update(running[0], running[1], 1.0)  # of a batch norm
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Update critics, and every ``policy_delay`` steps actor and entropy coefficient, on batches from replay."""
@@ -143,6 +173,7 @@ class StableSAC(DelayedSAC):
                 self.actor.optimizer.zero_grad()
                 actor_loss.backward()
                 self.actor.optimizer.step()
+                self._average_actor()
                 losses["actor_loss"].append(actor_loss.item())
 
                 # Entropy coefficient

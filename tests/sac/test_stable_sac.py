@@ -13,6 +13,7 @@ from small_agent import make as make_agent
 from small_task import Drift, delayed
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import VecNormalize
 from torch.nn import functional as F
 
@@ -24,6 +25,7 @@ AS_SADR = {
     "scale_rewards": False,
     "normalise_states": False,
     "policy_delay": 1,
+    "actor_averaging": 0.0,
     "ent_coef": "auto",
     "target_entropy": "auto",
 }
@@ -148,6 +150,49 @@ def test_the_actor_is_slower():
     assert changes == [False, False, True] * 4
 
 
+class Normalized(FlattenExtractor):
+    def __init__(self, observation_space):
+        super().__init__(observation_space)
+        self.norm = th.nn.BatchNorm1d(self.features_dim)
+
+    def forward(self, observations):
+        return self.norm(super().forward(observations))
+
+
+@pytest.mark.parametrize("decay", [0.5, 0.999])
+def test_the_average_of_the_actor(decay):
+    """Of the first updates the plain mean, later one that forgets."""
+    kwargs = {"policy_kwargs": {"net_arch": [16], "features_extractor_class": Normalized}, "policy_delay": 1}
+    model = make(Drift(), actor_averaging=decay, learning_starts=1000, **kwargs).learn(40)
+    average, expected = model.policy.averaged_actor, None
+    for n in range(1, 7):
+        model.train(1, 16)
+        weights = model.actor.mu.weight.detach().clone()
+        keep = min(decay, 1 - 1 / n)
+        expected = weights if expected is None else keep * expected + (1 - keep) * weights
+        th.testing.assert_close(average.mu.weight, expected)
+    running = "features_extractor.extractor.norm.running_mean"
+    assert th.equal(average.state_dict()[running], model.actor.state_dict()[running]) and not average.training
+    assert model.policy.state_normalizer.deviation.min() > 0.05  # shared, and left alone
+
+
+def test_the_average_answers_and_the_actor_collects(tmp_path):
+    model = make(delayed(2)).learn(60)
+    obs, _ = delayed(2).reset(seed=0)
+    with th.no_grad():
+        model.policy.averaged_actor.mu.bias.fill_(5.0)
+        model.actor.mu.bias.fill_(-5.0)
+    assert model.predict(obs, deterministic=True)[0] == pytest.approx(2.0, abs=0.1)
+    with model.policy.without_average():
+        assert model.predict(obs, deterministic=True)[0] == pytest.approx(-2.0, abs=0.1)
+    model.learn(10, reset_num_timesteps=False)
+    stored = model.replay_buffer.actions[60:70]
+    assert stored.mean() < -0.8
+    model.save(tmp_path / "agent")
+    loaded = StableSAC.load(tmp_path / "agent", device="cpu")
+    assert loaded.predict(obs, deterministic=True)[0] == pytest.approx(2.0, abs=0.1)
+
+
 def test_without_its_parts_it_learns_as_delayed_sac():
     """But for the order of an update: so values agree, and no number does exactly."""
     kwargs = {"gamma": 0.8, "tau": 0.1, "learning_rate": 1e-2, "batch_size": 64}
@@ -199,6 +244,14 @@ def test_beside_vec_normalize():
     np.testing.assert_allclose(values, 7 / (1 - 0.8), rtol=0.15)
 
 
-def test_a_policy_delay_below_one():
-    with pytest.raises(ValueError, match="policy_delay must be at least 1, got 0"):
-        make(policy_delay=0)
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"policy_delay": 0}, "policy_delay must be at least 1, got 0"),
+        ({"actor_averaging": 1.0}, r"actor_averaging is a decay in \[0, 1\), got 1.0"),
+        ({"actor_averaging": -0.1}, "got -0.1"),
+    ],
+)
+def test_settings_out_of_range(given, message):
+    with pytest.raises(ValueError, match=message):
+        make(**given)

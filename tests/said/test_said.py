@@ -52,7 +52,7 @@ def test_batch_norm_learns_nothing_from_the_planners_training():
     said = make(Drift(), planner_train_freq=30, **kwargs).learn(97)
     sac = make(Drift(), StableSAC, **kwargs).learn(97)
     expected = sac.policy.state_dict()
-    assert "critic.features_extractor.norm.running_mean" in expected
+    assert "critic.features_extractor.extractor.norm.running_mean" in expected
     th.testing.assert_close({key: said.policy.state_dict()[key] for key in expected}, expected, rtol=0, atol=0)
 
 
