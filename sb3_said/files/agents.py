@@ -44,12 +44,18 @@ class SafeSaveMixin(OffPolicyAlgorithm):
     )  # fmt: skip
     own_classes: ClassVar[tuple[type, ...]] = ()
 
-    def save(self, path: PathOrFile) -> None:  # type: ignore[override]  # without SB3's exclude and include
+    task: str | None = None
+    """id of the Gymnasium task that it was made for, or loaded with"""
+
+    def save(self, path: PathOrFile, compact: bool = False) -> None:  # type: ignore[override]  # no exclude, include
         """Write the agent to a file, without its environment and replay buffer.
 
-        A constructor argument that cannot be written without pickle is named in a warning and in the file.
+        A constructor argument that cannot be written without pickle is named in a warning and in the file. The file's
+        metadata names the task, where it is a registered one.
 
         :param path: where to write; without a suffix, ``.zip`` is added. Or a binary file object.
+        :param compact: write matrices as float16 and no state of optimizers, as a quarter of the size is better to hand
+            on. Actions then differ in their last digits, and training goes on with fresh optimizers
         :raises ValueError: for spaces other than Box and Dict of Box
         """
         arguments: dict[str, Any] = {}
@@ -78,9 +84,15 @@ class SafeSaveMixin(OffPolicyAlgorithm):
             "n_envs": self.n_envs,
             **agent_state(self),
         }
+        if compact:
+            parameters = tree["parameters"]
+            tree["parameters"] = {name: {} if "optimizer" in name else part for name, part in parameters.items()}
+            tree["parameters"]["policy"] = {name: _in_half(value) for name, value in parameters["policy"].items()}
         if isinstance(path, (str, os.PathLike)) and pathlib.Path(path).suffix == "":
             path = f"{os.fspath(path)}.zip"
-        save_tree(path, tree, kind=type(self).__name__)
+        if self.env is not None and (spec := self.env.get_attr("spec", 0)[0]) is not None:
+            self.task = spec.id
+        save_tree(path, tree, {"task": self.task}, kind=type(self).__name__)
 
     @classmethod
     def load(  # type: ignore[override]  # of files, too, that are open
@@ -151,6 +163,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
             with no_larger_than(saved["parameters"]["policy"]) if own_networks else contextlib.nullcontext():
                 model._setup_model()
             restore_agent(model, saved)
+            model.task = load_metadata(path)["metadata"].get("task")
             if model.env is not None:
                 model.set_env(model.env)
         if model.use_sde:  # its noise was drawn before the parameters were there
@@ -283,6 +296,7 @@ def _fitting_parameters(model: SafeSaveMixin, saved: dict[str, Any], exact: bool
     """Return what a model takes over of saved networks and optimizers, once it is known to fit."""
     saved, own = model._adapt_parameters(saved), model.get_parameters()
     check_names("parameters", saved, own, exact)
+    saved = {name: _in_full(state, own[name]) for name, state in saved.items()}
     for name, state in saved.items():
         target = recursive_getattr(model, name)
         if isinstance(target, th.optim.Optimizer):
@@ -290,6 +304,22 @@ def _fitting_parameters(model: SafeSaveMixin, saved: dict[str, Any], exact: bool
         else:
             check_tensors(name, state, own[name], exact)
     return saved
+
+
+def _in_half(value: th.Tensor) -> th.Tensor:
+    """Return a matrix as float16, if it is one of float32 that stays finite; counts and statistics stay exact."""
+    half = value.half() if value.dtype == th.float32 and value.ndim > 1 else value
+    return half if half.isfinite().all() else value
+
+
+def _in_full(state: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+    """Return tensors that :func:`_in_half` wrote in the types of the model's own."""
+
+    def full(name: str, value: Any) -> Any:
+        is_half = isinstance(value, th.Tensor) and value.dtype == th.float16 and isinstance(own.get(name), th.Tensor)
+        return value.to(own[name].dtype) if is_half else value
+
+    return {name: full(name, value) for name, value in state.items()}
 
 
 def _take_parameters(model: SafeSaveMixin, saved: dict[str, Any], exact: bool = True) -> None:

@@ -25,11 +25,12 @@ from sb3_said import DelayedSAC, __version__
 from sb3_said.delays import DelayProcess, FixedDelay
 from sb3_said.delays.space import ages_of, has_state_history
 from sb3_said.evaluation.rollout import Observation, Rollout, rollout
+from sb3_said.files.archive import SavedFileError, load_metadata
 from sb3_said.files.normalization import load_normalization, normalization_file
 from sb3_said.said.policies import Answer
 from sb3_said.zoo.answer import EXPERT_FOLDER
 from sb3_said.zoo.arguments import Delay, largest_delay
-from sb3_said.zoo.manager import ALGOS
+from sb3_said.zoo.manager import ALGORITHMS, ALGOS
 from sb3_said.zoo.record import RECORD_NAME, WRAPPER, Record, import_packages, make_wrapper
 
 ANSWERS = get_args(Answer)
@@ -79,8 +80,8 @@ def load_run(
     Nothing in its files is run. What makes the task is: the installed modules that ``run.json`` names are imported.
 
     :param path: a run folder such as ``logs/said/Hopper-v5-delay4-seed1_1``, or an agent's ``.zip``
-    :param algo: name of the algorithm; read from the run folder where there is one
-    :param env_id: task to play; the one of the run folder by default
+    :param algo: name of the algorithm; read from the run folder where there is one, or else from the file
+    :param env_id: task to play; the one of the run folder or of the file by default
     :param delay: observation delay to play under; the trained one by default, and outside a run folder the largest that
         the agent was built for
     :param device: torch device
@@ -91,12 +92,15 @@ def load_run(
     """
     file, record = find_agent(Path(path))
     hyperparams = record.hyperparams if record is not None else {}
-    algo = algo or (record.algo if record is not None else None)
-    env_id = env_id or (record.env if record is not None else None)
+    if record is None and (algo is None or env_id is None):
+        own_algo, own_task = described(file)
+        algo, env_id = algo or own_algo, env_id or own_task
+    elif record is not None:
+        algo, env_id = algo or record.algo, env_id or record.env
     if algo not in ALGOS:
         raise ValueError(f"The algorithm of {file} is not known ({algo}): give --algo, one of {', '.join(ALGOS)}.")
     if env_id is None:
-        raise ValueError(f"The task of {file} is not known, since no run folder is around it: give --env.")
+        raise ValueError(f"The task of {file} is not known: no run folder is around it, and it names none. Give --env.")
     for key in ("frame_stack", "vec_env_wrapper"):
         if hyperparams.get(key):
             raise ValueError(f"{file} was trained with {key}={hyperparams[key]}, which cannot be played here.")
@@ -125,6 +129,20 @@ def load_run(
     info = {"algo": algo, "env": env_id, "delay": delay_name(delay_process)}
     info |= {"file": str(file), "trained_steps": model.num_timesteps}
     return LoadedRun(model, make_env, _load_normalize(file, record, make_env), file.parent, info)
+
+
+def described(file: Path) -> tuple[str | None, str | None]:
+    """Return the algorithm and the task that an agent's file names, as far as it does.
+
+    A task whose id names a module to import (``module:Task-v0``) is not taken from a file.
+    """
+    try:
+        metadata = load_metadata(file)
+    except SavedFileError:  # of SB3's own algorithms
+        return None, None
+    names = [name for name, (kind, _) in ALGORITHMS.items() if kind.__name__ == metadata["kind"]]
+    task = metadata["metadata"].get("task")
+    return (names[0] if len(names) == 1 else None), (task if isinstance(task, str) and ":" not in task else None)
 
 
 def find_agent(path: Path) -> tuple[Path, Record | None]:

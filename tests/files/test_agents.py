@@ -618,3 +618,37 @@ def test_pickles_and_files_of_sb3_are_refused_and_not_run(tmp_path):
     other.policy.load_state_dict(trusted.policy.state_dict())
     assert same(ours.get_parameters(), trusted.get_parameters())
     assert same(dict(other.policy.state_dict()), dict(trusted.policy.state_dict()))
+
+
+def test_a_compact_file_is_smaller_and_acts_alike(tmp_path):
+    model = make_sac(policy_kwargs={"net_arch": [128, 128]}).learn(40)
+    model.save(tmp_path / "whole.zip")
+    model.save(tmp_path / "compact.zip", compact=True)
+    assert 4 * (tmp_path / "compact.zip").stat().st_size < (tmp_path / "whole.zip").stat().st_size
+    loaded = DelayedSAC.load(tmp_path / "compact.zip", env=gym.make("Pendulum-v1"), device="cpu")
+    assert not loaded.actor.optimizer.state and loaded.num_timesteps == 40
+    for name, value in model.policy.state_dict().items():
+        ours = loaded.policy.state_dict()[name]
+        assert ours.dtype == value.dtype
+        th.testing.assert_close(ours, value, rtol=1e-3 if value.ndim > 1 else 0, atol=1e-6 if value.ndim > 1 else 0)
+    obs = np.array([[0.6, 0.8, 1.0], [-1.0, 0.0, -3.0]], np.float32)
+    answers = [agent.predict(obs, deterministic=True)[0] for agent in (model, loaded)]
+    np.testing.assert_allclose(*answers, atol=0.02)
+    assert not np.array_equal(*answers)
+    loaded.learn(10)
+
+
+def test_what_is_too_large_for_half_precision_stays_whole(tmp_path):
+    model = make_sac().learn(20)
+    with th.no_grad():
+        model.actor.mu.weight[0, 0] = 1e6
+    model.save(tmp_path / "compact.zip", compact=True)
+    assert DelayedSAC.load(tmp_path / "compact.zip", device="cpu").actor.mu.weight[0, 0] == 1e6
+
+
+def test_the_file_names_the_task(tmp_path):
+    make_sac().learn(20).save(tmp_path / "agent.zip")
+    assert load_metadata(tmp_path / "agent.zip")["metadata"] == {"task": "Pendulum-v1"}
+    loaded = DelayedSAC.load(tmp_path / "agent.zip", device="cpu")
+    loaded.save(tmp_path / "again.zip")  # without an environment
+    assert loaded.task == load_metadata(tmp_path / "again.zip")["metadata"]["task"] == "Pendulum-v1"

@@ -1,0 +1,170 @@
+"""Write a model card beside an agent's file, in the form of the Hugging Face Hub, from what was measured of it."""
+
+from __future__ import annotations
+
+import hashlib
+import shlex
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from huggingface_hub import EvalResult, ModelCard, ModelCardData
+
+from sb3_said.delays.space import written_ages
+from sb3_said.zoo.arguments import explained, make_parser
+from sb3_said.zoo.cells import Cell, Results, average
+from sb3_said.zoo.record import Record
+from sb3_said.zoo.runs import LoadedRun, load_run, longest_delay
+
+EPILOG = """\
+examples:
+  # an agent to hand on, its returns over delay, its card
+  sb3-said decide logs/said/Hopper-v5-delay0-16-seed1_1 --compact -o agents/hopper.zip
+  sb3-said over-delays SAID=agents/hopper.zip --delays 0 4 8 16 --episodes 50 --json hopper.json
+  sb3-said evaluate agents/hopper.zip --json hopper_latency.json
+  sb3-said card agents/hopper.zip --run logs/said/Hopper-v5-delay0-16-seed1_1 --returns hopper.json \\
+      --latency 3.1   # writes agents/hopper.md
+
+The returns must be of this very file: one that was measured before the file was written anew is refused.
+"""
+
+TEMPLATE = """\
+---
+{{ card_data }}
+---
+
+# {{ title }}
+
+{{ text }}
+"""
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = make_parser(__doc__, EPILOG)
+    parser.add_argument("agent", type=Path, metavar="ZIP", help="the agent's file")
+    parser.add_argument("--run", type=Path, required=True, help="folder of the run that made it: command, seed, budget")
+    parser.add_argument(
+        "--returns", type=Path, required=True, metavar="JSON", help="what over-delays wrote of the file"
+    )
+    parser.add_argument("--latency", type=float, metavar="MS", help="median time of a decision, as evaluate printed it")
+    parser.add_argument("-o", "--output", type=Path, metavar="MD", help="the card (default: beside the agent, .md)")
+    args = parser.parse_args(argv)
+    with explained(parser):
+        card = make_card(load_run(args.agent), Record.read(args.run), Results(args.returns, None), args.latency)
+    target = args.output or args.agent.with_suffix(".md")
+    card.save(target)
+    print(f"Wrote {target}")
+
+
+def make_card(run: LoadedRun, record: Record, results: Results, latency_ms: float | None = None) -> ModelCard:
+    """Return the card of an agent.
+
+    :param run: the agent's file
+    :param record: of the run that made it
+    :param results: of ``over-delays``, with cells of this file
+    :param latency_ms: median time of a decision
+    :raises ValueError: when the results hold nothing of this file
+    """
+    file = Path(run.info["file"])
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    cells = [cell for cell in results.cells if cell.sha256 == digest and cell.result is not None]
+    who = run.model.policy.who_answers if hasattr(run.model.policy, "who_answers") else None
+    answered = [cell for cell in cells if cell.answer == who and not cell.age_error]
+    if not answered:
+        raise ValueError(
+            f"{results.path} holds no returns of {file} as it is now: play it with sb3-said over-delays X={file} "
+            f"--json {results.path} first."
+        )
+    env_id, returns = run.info["env"], np.concatenate([cell.result["returns"] for cell in answered if cell.result])
+    delays = ", ".join(str(cell.delay) for cell in answered)
+    result = EvalResult(
+        task_type="reinforcement-learning",
+        task_name="reinforcement-learning",
+        dataset_name=env_id,
+        dataset_type=env_id,
+        metric_type="mean_reward",
+        metric_name=f"mean_reward, observation delays {delays}",
+        metric_value=f"{returns.mean():.2f} +/- {returns.std():.2f}",
+        verified=False,
+    )
+    data = ModelCardData(
+        library_name="stable-baselines3",
+        tags=[env_id, "deep-reinforcement-learning", "reinforcement-learning", "stable-baselines3", "sb3_said"],
+        model_name=type(run.model).__name__,
+        eval_results=[result],
+    )
+    text = describe(run, record, results, cells, answered, latency_ms)
+    title = f"{type(run.model).__name__} on {env_id} under observation delay"
+    return ModelCard.from_template(data, template_str=TEMPLATE, title=title, text=text)
+
+
+def describe(
+    run: LoadedRun,
+    record: Record,
+    results: Results,
+    cells: list[Cell],
+    answered: list[Cell],
+    latency_ms: float | None,
+) -> str:
+    """Return the card's text: how to use it, how it was made, and what it returned."""
+    file, env_id = Path(run.info["file"]), run.info["env"]
+    kind = type(run.model).__name__
+    n_episodes, seed = results.settings["n_episodes"], results.settings["seed"]
+    facts: dict[str, Any] = {
+        "ages trained on": written_ages(run.model.trained_ages or []) + " control steps",  # type: ignore[attr-defined]
+        "largest age it reads": f"{longest_delay(run.model) or 0} control steps",
+        "control period": control_period(env_id),
+        "who answers": answered[0].answer or kind,
+        "environment steps": f"{run.model.num_timesteps:,}",
+        "training seed": record.seed,
+        "made by": f"`{made_by(record)}`",
+        "median decision": "not measured" if latency_ms is None else f"{latency_ms:g} ms, one CPU thread",
+    }
+    lines = [
+        "```python",
+        f"from sb3_said import {kind}",
+        "",
+        f'model = {kind}.load("{file.name}")',
+        "action, _ = model.predict(observation, deterministic=True)  # of a DelayedObservationWrapper",
+        "```",
+        "",
+        f"`sb3-said enjoy {file.name} --delay {longest_delay(run.model) or 0} --record video.mp4` shows it.",
+        "",
+        "| | |",
+        "|---|---|",
+        *(f"| {name} | {value} |" for name, value in facts.items()),
+        "",
+        f"Mean returns of {n_episodes} episodes (reset seeds {seed}..{seed + n_episodes - 1}) with 95 % intervals over "
+        "these episodes, of one training seed:",
+        "",
+    ]
+    columns = list(dict.fromkeys(cell.column for cell in cells))
+    rows = list(dict.fromkeys(cell.answer or kind for cell in cells))
+    lines += ["| under delay | " + " | ".join(rows) + " |", "|---" * (len(rows) + 1) + "|"]
+    for column in columns:
+        texts = []
+        for row in rows:
+            found = [c.result for c in cells if c.column == column and (c.answer or kind) == row]
+            texts.append(average({column: np.array(found[0]["returns"])}, [column])[0] if found and found[0] else "-")
+        lines.append(f"| {column} | " + " | ".join(texts) + " |")
+    return "\n".join(lines)
+
+
+def control_period(env_id: str) -> str:
+    """Return the time of a control step of a task, as far as it says."""
+    env = gym.make(env_id)
+    seconds = getattr(env.unwrapped, "dt", None) or 1 / float(env.metadata.get("render_fps") or np.inf)
+    env.close()
+    return f"{1000 * seconds:g} ms" if seconds else "unknown"
+
+
+def made_by(record: Record) -> str:
+    """Return the command that trains such an agent."""
+    delay, steps = record.delay, record.options.get("n_timesteps")
+    words = ["sb3-said train", "--algo", record.algo, "--env", record.env, "--preset", record.preset]
+    if delay is not None:
+        words += ["--delay", *([str(x) for x in delay] if isinstance(delay, list) else [shlex.quote(str(delay))])]
+    if steps and steps > 0:  # rl_zoo3's -1 leaves it to the YAML
+        words += ["-n", str(steps)]
+    return " ".join([*words, "--seed", str(record.seed)])

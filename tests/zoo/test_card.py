@@ -1,0 +1,68 @@
+"""sb3-said card: what stands in it is what was measured of that very file."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rl_zoo3")
+
+from huggingface_hub import ModelCard
+from small_run import ENV, write_run
+
+from sb3_said import SAID
+from sb3_said.zoo import card, decide, evaluate, over_delays
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_run(tmp_path_factory.mktemp("said") / f"{ENV}-delay2_1", SAID, 2)
+
+
+def test_an_agent_handed_on_and_its_card(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    agent, returns = tmp_path / "agent.zip", tmp_path / "returns.json"
+    decide.main([str(run), "--compact", "-o", str(agent)])
+    with pytest.raises(SystemExit):
+        card.main([str(agent), "--run", str(run), "--returns", str(returns)])
+    assert "name the runs to play" in capsys.readouterr().err
+    delays = ["--delays", "0", "UniformDelay(0, 2)", "--episodes", "3", "--device", "cpu"]
+    over_delays.main([f"x={agent}", *delays, "--age-errors", "1", "--json", str(returns)])  # without --env or --algo
+    card.main([str(agent), "--run", str(run), "--returns", str(returns), "--latency", "1.5"])
+
+    written = ModelCard.load(agent.with_suffix(".md"))
+    cells = json.loads(returns.read_text())["cells"]
+    who = SAID.load(agent, device="cpu").policy.who_answers
+    right = [cell["result"]["returns"] for cell in cells if cell["answer"] == who and not cell["age_error"]]
+    result = written.data.eval_results[0]
+    assert written.data.library_name == "stable-baselines3" and written.data.model_name == "SAID"
+    assert result.metric_value == f"{np.mean(right):.2f} +/- {np.std(right):.2f}" and result.dataset_name == ENV
+    text = written.text
+    assert "| ages trained on | 2 control steps |" in text and "| median decision | 1.5 ms, one CPU thread |" in text
+    assert f"`sb3-said train --algo said --env {ENV}" in text and "| under delay | planner | expert |" in text
+    assert f"| 0 | {np.mean(right[0]):.1f} [" in text and "| UniformDelay(0, 2), age +1 |" in text
+    assert "| control period | 40 ms |" in text
+
+
+def test_returns_of_another_file_are_refused(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    agent, returns = tmp_path / "agent.zip", tmp_path / "returns.json"
+    over_delays.main([f"x={run}", "--delays", "0", "--episodes", "2", "--device", "cpu", "--json", str(returns)])
+    decide.main([str(run), "--compact", "-o", str(agent)])
+    with pytest.raises(SystemExit):
+        card.main([str(agent), "--run", str(run), "--returns", str(returns)])
+    assert "holds no returns of" in capsys.readouterr().err
+
+
+def test_a_file_alone_names_its_task(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    agent = tmp_path / "agent.zip"
+    decide.main([str(run), "--compact", "-o", str(agent)])
+    target = tmp_path / "evaluation.json"
+    evaluate.main([str(agent), "--json", str(target), "--episodes", "1", "--latency-calls", "0", "--device", "cpu"])
+    found = json.loads(target.read_text())
+    assert (found["algo"], found["env"], found["delay"]) == ("said", ENV, 2)
+    model = SAID.load(agent, device="cpu")
+    model.task = "os:Evil-v0"  # gymnasium would import the module
+    model.save(agent)
+    with pytest.raises(SystemExit):
+        evaluate.main([str(agent), "--json", str(target), "--episodes", "1"])
+    assert "Give --env" in capsys.readouterr().err
