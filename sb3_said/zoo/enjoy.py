@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import sys
 from contextlib import closing, nullcontext
@@ -10,10 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import torch as th
 
 from sb3_said.zoo.arguments import TRUST, add_run, check_positive, explained, make_parser, read_delay
-from sb3_said.zoo.runs import ANSWERS, answering, load_run
+from sb3_said.zoo.runs import ANSWERS, LoadedRun, answering, load_run, longest_delay
 
 EPILOG = f"""\
 examples:
@@ -22,6 +24,9 @@ examples:
 
   # a video at real speed, on a machine without a display
   sb3-said enjoy logs/said/Hopper-v5-delay4-seed1_1 --record hopper.mp4
+
+  # left the same agent told that every observation is new, right as it is: what ignoring the delay costs
+  sb3-said enjoy agents/hopper.zip --delay 8 --beside-ignorant --size 240 --record hopper.gif --fps 12
 
   # the expert from the same starts, as a GIF
   sb3-said enjoy logs/said/Hopper-v5-delay4-seed1_1 --answer expert --record hopper_expert.gif
@@ -70,12 +75,16 @@ class Video:
         self._steps += 1
         if due < self.frames:
             return
-        if self._writer is None:
+        if self.frames == 0:
             follow(env)
         try:
             frame: Any = env.render()
         except Exception as error:
             raise CannotDraw(error) from error
+        self.append(frame)
+
+    def append(self, frame: np.ndarray) -> None:
+        """Write a frame, (height, width, 3) of uint8."""
         if self._writer is None:
             self._open()
         self._writer.append_data(frame)
@@ -92,6 +101,31 @@ class Video:
     def close(self) -> None:
         if self._writer is not None:
             self._writer.close()
+
+
+class SideBySide(Video):
+    """A video of two plays of the same starts, the first on the left; the one that ends first stays there, darker."""
+
+    def __init__(self, path: Path, fps: int):
+        super().__init__(path, fps)
+        self._plays: list[list[np.ndarray]] = []
+
+    def begin(self) -> None:
+        """Say that the next steps are of the next play."""
+        self._plays.append([])
+        self.frames = self._steps = 0
+
+    def append(self, frame: np.ndarray) -> None:
+        self._plays[-1].append(frame)
+        self.frames += 1
+
+    def close(self) -> None:
+        length = max((len(frames) for frames in self._plays), default=0)
+        padded = [frames + [frames[-1] // 2] * (length - len(frames)) for frames in self._plays if frames]
+        self.frames = 0
+        for pair in zip(*padded, strict=True):
+            super().append(np.concatenate(pair, axis=1))
+        super().close()
 
 
 def follow(env: gym.Env[Any, Any]) -> None:
@@ -125,6 +159,9 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--record", type=Path, metavar="FILE", help="write a video (.mp4 or .gif) instead of a window")
     parser.add_argument("--fps", type=int, default=25, help="frames a second, at most one a step (default: 25)")
     parser.add_argument("--answer", choices=ANSWERS, help="who acts in a SAID agent (default: as it was saved)")
+    parser.add_argument("--size", type=int, metavar="PIXELS", help="height and width of the picture, of MuJoCo tasks")
+    parser.add_argument("--beside-ignorant", action="store_true", help="show, on the left, the same agent told that "
+                        "every observation is new (with --record)")  # fmt: skip
     args = parser.parse_args(argv)
     displays = [name for name in ("DISPLAY", "WAYLAND_DISPLAY") if os.environ.get(name)]
     if sys.platform.startswith("linux") and not displays:
@@ -132,22 +169,40 @@ def main(argv: list[str] | None = None) -> None:
             parser.error("there is no display here to open a window on: give --record FILE.mp4")
         os.environ.setdefault("MUJOCO_GL", "egl")
     with explained(parser):
-        check_positive(args, "episodes", "fps", "num_threads")
+        check_positive(args, "episodes", "fps", "num_threads", "size")
         th.set_num_threads(args.num_threads)
         video = None
         if args.record is not None:
             check_can_record(args.record)
-            video = Video(args.record, args.fps)
-        drawn = {"render_mode": "rgb_array" if video else "human"}
+            video = (SideBySide if args.beside_ignorant else Video)(args.record, args.fps)
+        elif args.beside_ignorant:
+            raise ValueError("--beside-ignorant makes a video of two plays: give --record FILE.gif, too.")
+        drawn: dict[str, Any] = {"render_mode": "rgb_array" if video else "human"}
+        if args.size is not None:
+            drawn |= {"width": args.size, "height": args.size}
         played = args.algo, args.env, read_delay(args.delay), args.device, drawn, args.gym_packages
         run = load_run(args.run, *played)
         with answering(run.model, args.answer), closing(video) if video else nullcontext():
-            run.play(
-                args.episodes,
-                args.seed,
-                deterministic=not args.stochastic,
-                on_step=video.on_step if video else None,
-                on_episode=lambda i, ret, n: print(f"seed {args.seed + i}: return {ret:,.1f} in {n} steps"),
-            )
+            if isinstance(video, SideBySide):
+                video.begin()
+                show(run, args, video, age_error=-(longest_delay(run.model) or 0))
+                video.begin()
+            show(run, args, video)
     if video:
         print(f"Wrote {args.record}: {video.frames} frames at {video.fps:g} a second")
+
+
+def show(run: LoadedRun, args: argparse.Namespace, video: Video | None, age_error: int = 0) -> None:
+    """Play the episodes and print how each ended.
+
+    :param age_error: control steps that the age is told wrong by
+    """
+    told = ", told that every observation is new" if age_error else ""
+    run.play(
+        args.episodes,
+        args.seed,
+        age_error=age_error,
+        deterministic=not args.stochastic,
+        on_step=video.on_step if video else None,
+        on_episode=lambda i, ret, n: print(f"seed {args.seed + i}{told}: return {ret:,.1f} in {n} steps"),
+    )

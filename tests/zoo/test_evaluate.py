@@ -171,6 +171,28 @@ def test_enjoy_prints_every_episode(run: Path, tmp_path: Path, capsys: pytest.Ca
     assert "seed 10000: return" in out and "seed 10001: return" in out and film.stat().st_size > 0
 
 
+def test_an_agent_beside_itself_that_ignores_the_delay(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    imageio = pytest.importorskip("imageio.v3")
+    drawn = iter(range(10_000))
+    monkeypatch.setattr(
+        "gymnasium.envs.mujoco.MujocoEnv.render", lambda self: np.full((16, 16, 3), 100 + next(drawn) % 100, np.uint8)
+    )
+    monkeypatch.setattr(enjoy, "check_can_record", lambda path: None)
+    film = tmp_path / "film.gif"
+    enjoy.main([str(run), "--record", str(film), "--beside-ignorant", "--delay", "2", "--device", "cpu"])
+    out = capsys.readouterr().out
+    lengths = [int(line.split()[-2]) for line in out.splitlines() if line.startswith("seed 10000")]
+    assert "seed 10000, told that every observation is new: return" in out and len(lengths) == 2
+    frames = imageio.imread(film)
+    assert frames.shape[1:] == (16, 32, 3) and f"{len(frames)} frames" in out
+    shorter = frames[-1, :, :16] if lengths[0] < lengths[1] else frames[-1, :, 16:]
+    assert lengths[0] == lengths[1] or shorter.max() < 105  # it fell, and stays there darker
+    with pytest.raises(SystemExit):
+        enjoy.main([str(run), "--beside-ignorant"])
+
+
 def test_enjoy_draws_an_mp4(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
                             capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
     imageio = pytest.importorskip("imageio")
