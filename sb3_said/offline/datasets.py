@@ -148,12 +148,17 @@ def load_dataset(
     return _joined(read)
 
 
+def is_file(source: Any) -> bool:
+    """Tell whether a dataset is meant as the path of a file, by its suffix; other text is an id of Minari."""
+    return isinstance(source, (str, os.PathLike)) and Path(source).suffix in (".hdf5", ".h5", ".npz")
+
+
 def _read(source: Any, state_space: spaces.Box, action_space: spaces.Box, env_id: str | None, bar: bool) -> Dataset:
     if isinstance(source, Dataset):
         return source
     if isinstance(source, ReplayBuffer):
         trajectories, name = _of_buffer(source), type(source).__name__
-    elif isinstance(source, (str, os.PathLike)) and Path(source).suffix in (".hdf5", ".h5", ".npz"):
+    elif is_file(source):
         name = os.fspath(source)
         trajectories = [_of_columns(name, _read_columns(Path(source)))]
     else:

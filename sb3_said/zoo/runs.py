@@ -146,10 +146,14 @@ def delay_name(process: DelayProcess) -> int | str:
 
 
 def answers(model: BaseAlgorithm) -> list[str | None]:
-    """Return who can answer: SAID's expert, and its planner once that is trained; None for another agent alone."""
+    """Return who can answer: SAID's planner once it is trained, and its expert; None for another agent alone.
+
+    An expert that made no update, as after learning from logs, answers only where there is nobody else.
+    """
     if not hasattr(model.policy, "answering"):
         return [None]
-    return [who for who in ANSWERS if who != "planner" or model.policy.planner_is_trained]
+    learned = {"planner": model.policy.planner_is_trained, "expert": model._n_updates > 0}
+    return [who for who in ANSWERS if learned[who]] or ["expert"]
 
 
 def answering(model: BaseAlgorithm, answer: str | None) -> AbstractContextManager[Any]:

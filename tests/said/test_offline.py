@@ -115,7 +115,7 @@ def test_a_resumed_training_ends_as_one_that_never_stopped(tmp_path):
     resumed_training = resumed.learn_offline(
         log(), 8, folder=tmp_path, save_interval=2, callback=lambda a, _: begun.append(a["self"].num_timesteps) or True
     )
-    assert begun[0] == 5
+    assert begun[0] == 3  # the checkpoint of update 4 was to follow its callbacks
     th.testing.assert_close(weights(resumed_training), whole, rtol=0, atol=0)
 
 
