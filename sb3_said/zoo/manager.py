@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from sb3_said import SAID, DelayedSAC, PlannerTrainingCallback
 from sb3_said.files.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback, restore_training
 from sb3_said.files.normalization import load_normalization, normalization_file, save_normalization
-from sb3_said.offline import BC, OfflineAlgorithm
+from sb3_said.offline import BC, DQL, OfflineAlgorithm
 from sb3_said.offline.datasets import is_file
 from sb3_said.zoo.answer import EXPERT_FOLDER, evaluate_answer
 from sb3_said.zoo.arguments import Delay, largest_delay
@@ -38,6 +38,7 @@ ALGORITHMS: dict[str, tuple[type[DelayedSAC], dict[str, bool]]] = {
     "dr": (DelayedSAC, {"augment_state": False, "delay_reconciled_critic": True}),
     "sadr": (DelayedSAC, {"augment_state": True, "delay_reconciled_critic": True}),
     "bc": (BC, {}),
+    "dql": (DQL, {}),
 }
 for _name, (_class, _) in ALGORITHMS.items():
     ALGOS[_name] = _class

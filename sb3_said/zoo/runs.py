@@ -185,7 +185,7 @@ def origin(run: LoadedRun) -> dict[str, Any]:
         "command": f"{program} {shlex.join(sys.argv[1:])}",
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} CPU cores",
-        "device": str(run.model.device),
+        "device": str(getattr(run.model, "device", "cpu")),  # random actions have none
         "torch_threads": th.get_num_threads(),
         "versions": {"python": platform.python_version(), "sb3_said": __version__, **{p: version(p) for p in packages}},
     }
