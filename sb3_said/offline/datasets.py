@@ -72,6 +72,15 @@ class Dataset:
         starts = np.concatenate([[0], np.flatnonzero(self.ends)[:-1] + 1])
         return np.add.reduceat(self.rewards.astype(np.float64), starts)
 
+    def select(self, keep: np.ndarray) -> Dataset:
+        """Return some of the trajectories.
+
+        :param keep: (n_trajectories,) bool
+        """
+        steps = np.repeat(keep, self.lengths)
+        columns = {field.name: getattr(self, field.name)[steps] for field in fields(self) if field.name != "finals"}
+        return Dataset(**columns, finals=self.finals[keep])
+
     def to_replay(
         self,
         observation_space: spaces.Space[Any],
