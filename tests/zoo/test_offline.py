@@ -16,7 +16,7 @@ from trained_run import ENV, PLANNER, train_here
 
 from sb3_said import SAID
 from sb3_said.files.archive import load_tree
-from sb3_said.offline import BC, IQL
+from sb3_said.offline import BC, DQL, IQL, REFERENCE_RETURNS, DQLConfig
 from sb3_said.zoo import evaluate, train, tune
 from sb3_said.zoo.manager import ALGOS
 from sb3_said.zoo.offline import OfflineExperimentManager
@@ -24,7 +24,7 @@ from sb3_said.zoo.presets import PRESETS, config_file, dataset_kind, preset_over
 from sb3_said.zoo.record import Record
 from sb3_said.zoo.runs import answers, load_run
 
-EVERY = "--eval-freq 20 --eval-episodes 2 --log-interval 20".split()
+EVERY = "--eval-freq 10 --eval-episodes 2 --log-interval 10".split()
 BC_PARAMS = ["-params", "batch_size:16", "policy_kwargs:dict(net_arch=[16])"]
 SAID_PARAMS = ["-params", f"planner_kwargs:{PLANNER}"]
 
@@ -61,8 +61,8 @@ def weights(run: Path, algo: str) -> dict[str, Any]:
     return ALGOS[algo].load(run / f"{ENV}.zip", device="cpu").get_parameters()["policy"]
 
 
-def command(algo: str, log: Path, steps: int = 40) -> list[str]:
-    words = f"--algo {algo} --env {ENV} --delay 0 2 --dataset {log} -n {steps} --seed 3 --checkpoint-freq 10"
+def command(algo: str, log: Path, steps: int = 20) -> list[str]:
+    words = f"--algo {algo} --env {ENV} --delay 0 2 --dataset {log} -n {steps} --seed 3 --checkpoint-freq 5"
     return words.split()
 
 
@@ -80,10 +80,10 @@ def test_a_run_leaves_its_agent_record_log_and_evaluations(finished: tuple[str, 
     assert run.name == f"{ENV}-delay0-2-little-medium-seed3_1"
     model = load_run(run, device="cpu").model
     assert isinstance(model, {"bc": BC, "said": SAID}[algo])
-    assert model.num_timesteps == 40 and answers(model) == [None if algo == "bc" else "planner"]
-    assert model._n_updates == (40 if algo == "bc" else 0)  # no expert learns beside a planner
+    assert model.num_timesteps == 20 and answers(model) == [None if algo == "bc" else "planner"]
+    assert model._n_updates == (20 if algo == "bc" else 0)  # no expert learns beside a planner
     assert Record.read(run).dataset == [str(log)]
-    assert np.load(run / "evaluations.npz")["timesteps"].tolist() == [20, 40]
+    assert np.load(run / "evaluations.npz")["timesteps"].tolist() == [10, 20]
     assert not list(run.glob("*monitor.csv")) and not (run / "expert").exists()
     column = "train/action_error" if algo == "bc" else "iql/v_loss"
     assert column in (run / "progress.csv").read_text()
@@ -95,7 +95,7 @@ def test_a_killed_run_ends_as_one_that_was_not(
     algo, whole = finished
 
     def die_after(self: Any, watcher: Any, original: Any = BC._goes_on) -> bool:
-        if self.num_timesteps == 25:
+        if self.num_timesteps == 13:
             raise Killed
         return original(self, watcher)
 
@@ -125,14 +125,30 @@ def test_other_data_is_not_gone_on_with(log: Path, tmp_path: Path) -> None:
         train.main(["--resume", str(run_of(tmp_path, "bc")), "-n", "10"])
 
 
-def test_evaluate_plays_the_agent_and_tune_trains_depths_on_the_same_logs(
+def test_evaluate_has_scores_and_the_best_agent_beside_the_last(
     finished: tuple[str, Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     algo, run = finished
-    evaluate.main([str(run), "--episodes", "2", "--latency-calls", "0", "--device", "cpu", "--delay", "1"])
-    labels = [result["label"] for result in json.loads((run / "evaluation.json").read_text())["results"]]
-    assert labels[0] == ("bc" if algo == "bc" else "planner")
+    monkeypatch.setitem(REFERENCE_RETURNS, ENV.split("-")[0].lower(), (10.0, 210.0))
+    who = "bc" if algo == "bc" else "planner"
+    best = ALGOS[algo].load(run / f"{ENV}.zip", device="cpu")
+    for steps, labels in ((7, [(who, "last", 20), (who, "best", 7)]), (20, [(who, "last", 20)])):
+        best.num_timesteps = steps
+        best.save(run / "best_model.zip")
+        evaluate.main([str(run), "--episodes", "2", "--latency-calls", "0", "--device", "cpu", "--delay", "1"])
+        results = json.loads((run / "evaluation.json").read_text())["results"]
+        assert [(r["label"], r["which"], r["trained_steps"]) for r in results] == labels
+        for r in results:
+            assert r["normalized_score"][0] == pytest.approx((np.mean(r["returns"]) - 10) / 2)
+        assert ("best" in capsys.readouterr().out) == (steps == 7)
+    assert evaluate.score_of(evaluate.Summary.from_episodes("x", [1.0, 2.0], [1, 1]), "Pendulum-v1") is None
+
+
+def test_tune_trains_depths_on_the_same_logs(finished: tuple[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    algo, run = finished
     if algo == "bc":
+        with pytest.raises(SystemExit):
+            tune.main(["--run", str(run)])
         return
     monkeypatch.setattr(IQL, "step", lambda _: pytest.fail("V is the run's"))
     quick = "--depths 2 --temperatures 0.5 --sampling-steps 1 --episodes 2 --round 2 --report-episodes 2".split()
@@ -146,7 +162,7 @@ def test_evaluate_plays_the_agent_and_tune_trains_depths_on_the_same_logs(
     ("words", "message"),
     [
         ("--algo bc --delay 2", "--algo bc learns from logs: name them with --dataset"),
-        ("--algo sac --dataset {log}", "--dataset is for --algo said, bc"),
+        ("--algo sac --dataset {log}", "--dataset is for --algo said, bc, dql"),
         ("--algo said --delay 2 --expert-delay 0 --dataset {log}", "--expert-delay has no effect"),
         ("--algo bc --dataset nowhere.npz", "nowhere.npz, which is not there"),
         ("--algo said --dataset {log} -params planner_gradient_steps:3", "whose steps -n sets"),
@@ -169,7 +185,7 @@ def test_data_of_another_task_ends_the_program_with_a_reason(log: Path, tmp_path
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("algo", ["said", "bc"])
+@pytest.mark.parametrize("algo", ["said", "bc", "dql"])
 def test_every_preset_exists(algo: str, preset: str) -> None:
     made = preset_overrides(config_file(algo, True), preset, "Hopper-v5", 4, None, ["medium"])
     assert made or preset == "cpu"
@@ -209,7 +225,7 @@ def test_the_paper_preset_has_the_papers_pairs_by_the_datasets_name() -> None:
 
 def test_a_stop_writes_a_checkpoint(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def ask(self: Any, watcher: Any, original: Any = BC._goes_on) -> bool:
-        if self.num_timesteps == 23:
+        if self.num_timesteps == 13:
             made[0].stopping.is_asked = True
         return original(self, watcher)
 
@@ -229,4 +245,13 @@ def test_a_stop_writes_a_checkpoint(log: Path, tmp_path: Path, monkeypatch: pyte
             train_here(tmp_path, " ".join(command(algo, log)), *params)
         assert stop.value.code == 130
         state = load_tree(run_of(tmp_path, algo) / f"{name}.zip")
-        assert (state["counters"]["num_timesteps"] if algo == "bc" else state["trainer"]["n_updates"]) == 23
+        assert (state["counters"]["num_timesteps"] if algo == "bc" else state["trainer"]["n_updates"]) == 13
+
+
+def test_dql_has_the_papers_settings_and_learns_here(log: Path, tmp_path: Path) -> None:
+    train_here(tmp_path, f"--algo dql --env {ENV} --delay 1 --dataset {log} --preset smoke -n 3 --seed 3")
+    model = load_run(run_of(tmp_path, "dql"), device="cpu").model
+    assert isinstance(model, DQL) and (model.augment_state, model.delay_reconciled_critic) == (True, False)
+    assert model.policy.config == DQLConfig() and model._n_updates == 3
+    made = preset_overrides(config_file("dql", True), "paper", "Hopper-v5", 4)
+    assert made == {"n_timesteps": 2_000_000}
