@@ -19,7 +19,7 @@ MAY_IMPORT = {
     "files": set(),
     "sac": {"delays", "replay", "files"},
     "said": {"delays", "replay", "planner", "files", "sac", "offline"},
-    "offline": {"delays", "replay", "planner", "sac"},
+    "offline": {"delays", "replay", "planner", "files", "sac"},
     "evaluation": set(),
     "zoo": {"", "delays", "replay", "planner", "files", "sac", "said", "offline", "evaluation"},
 }

@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_said.delays.space import check_spaces, unscale_action
+from sb3_said.files.atomic import replacing
 from sb3_said.offline.datasets import Dataset, is_file
 from sb3_said.offline.scores import reference_returns
 
@@ -61,8 +62,8 @@ def write_dataset(
             "next_observations": data.next_states,
             "about": np.array(about),
         }
-        Path(target).parent.mkdir(parents=True, exist_ok=True)
-        np.savez(target, **columns)
+        with replacing(target) as file:
+            np.savez(file, **columns)
         return
     from minari.data_collector import EpisodeBuffer
 

@@ -340,7 +340,7 @@ class SAID(OfflineAlgorithm):
         intervals = log_interval, eval_interval, save_interval
         training = PlannerTraining(self, trainer, values, lambda n_updates: n_updates, folder, *intervals, watcher)
         self.num_timesteps = trainer.n_updates
-        watcher.on_training_start(locals() | {"total_timesteps": total}, globals())
+        watcher.on_training_start(locals() | {"total_timesteps": total, "callback": watcher}, globals())
 
         def on_step(n_updates: int) -> bool:
             self.num_timesteps = n_updates

@@ -73,7 +73,8 @@ class Run:
         parts = [("delay", self.delay), ("expert", self.expert_delay)]
         words = {name: "-".join(re.findall(r"[\w.]+", str(delay))) for name, delay in parts if delay is not None}
         logs = [Path(source).stem if is_file(source) else source.rpartition("/")[2] for source in self.dataset]
-        return "".join(f"-{name}{text}" for name, text in words.items()) + "".join(f"-{log}" for log in logs)
+        plain = [re.sub(r"[^\w.-]+", "-", log) for log in logs]
+        return "".join(f"-{name}{text}" for name, text in words.items()) + "".join(f"-{log}" for log in plain)
 
     @property
     def max_delay(self) -> int:

@@ -57,6 +57,12 @@ def test_the_planner_answers_after_learning_from_logs(learned, tmp_path):
     assert loaded.value == "iql"
 
 
+def test_all_of_a_log_is_learned_from():
+    model = learn(make(planner_newest_fraction=0.2), steps=1)
+    assert len(model.make_planner_trainer(1).source) > 0.9 * len(log())
+    assert model.planner_newest_fraction == 1.0
+
+
 def test_candidates_are_scored_by_v_alone(learned, monkeypatch):
     monkeypatch.setattr(type(learned.policy), "q_value", lambda *_: pytest.fail("asked the critics"))
     obs, before = observe(), answer(learned, observe())
