@@ -19,9 +19,9 @@ MAY_IMPORT = {
     "files": set(),
     "sac": {"delays", "replay", "files"},
     "said": {"delays", "replay", "planner", "files", "sac", "offline"},
-    "offline": {"delays", "replay", "sac"},
+    "offline": {"delays", "replay", "planner", "files", "sac"},
     "evaluation": set(),
-    "zoo": {"", "delays", "replay", "planner", "files", "sac", "said", "evaluation"},
+    "zoo": {"", "delays", "replay", "planner", "files", "sac", "said", "offline", "evaluation"},
 }
 
 

@@ -6,6 +6,7 @@ import math
 import random
 import time
 import warnings
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -38,10 +39,18 @@ class TrainingCheckpointCallback(BaseCallback):
         the replay is large, so that checkpoints write at most half a megabyte a second (2.4 GB every 80 minutes)
     :param should_stop: asked before every rollout, where nothing is half done; learning then ends with a
         ``KeyboardInterrupt``
+    :param keeps_replay: False writes a checksum of the replay instead, where it is a dataset that a resume reads again
     """
 
-    def __init__(self, folder: str | Path, save_freq: int | None = None, should_stop: Callable[[], bool] | None = None):
+    def __init__(
+        self,
+        folder: str | Path,
+        save_freq: int | None = None,
+        should_stop: Callable[[], bool] | None = None,
+        keeps_replay: bool = True,
+    ):
         super().__init__()
+        self.keeps_replay = keeps_replay
         self.path = Path(folder) / CHECKPOINT_NAME
         self.save_freq = save_freq
         self.should_stop = should_stop or (lambda: False)
@@ -79,7 +88,7 @@ class TrainingCheckpointCallback(BaseCallback):
         assert isinstance(self.model, SafeSaveMixin)
         self._tried_at = self.model.num_timesteps
         if self._tried_at != self._saved_at:
-            state = training_state(self.model, self.locals.get("callback"))
+            state = training_state(self.model, self.locals.get("callback"), self.keeps_replay)
             check_finite(state, self.path)
             try:
                 save_tree(self.path, state)
@@ -127,22 +136,55 @@ def _numbers(tree: Any, where: str) -> Iterator[tuple[str, np.ndarray]]:
             yield where, array
 
 
-def training_state(model: SafeSaveMixin, callback: BaseCallback | None = None) -> dict[str, Any]:
+def training_state(
+    model: SafeSaveMixin, callback: BaseCallback | None = None, keeps_replay: bool = True
+) -> dict[str, Any]:
     """Return the state of a run as nested dicts of tensors, arrays and numbers.
 
     :param model: with a replay buffer that has a ``state_dict``
     :param callback: whose ``EvalCallback`` evaluations are kept too
+    :param keeps_replay: False for a checksum in the replay's place
     """
     return {
         **agent_state(model),
-        "replay_buffer": _replay_buffer(model).state_dict(),
+        "replay_buffer": _replay_buffer(model).state_dict() if keeps_replay else {"checksum": checksum(model)},
         "vec_normalize": get_statistics(model.get_vec_normalize_env()),
-        "evaluations": [
-            {name: np.array(getattr(evaluation, name)).tolist() for name in _EVALUATION}
-            for evaluation in _eval_callbacks(callback)
-        ],
+        "evaluations": evaluations_of(callback),
         "random": random_state(),
     }
+
+
+def checksum(model: OffPolicyAlgorithm) -> int:
+    """Return a number that tells replays apart: of their actions, a few of which agree by chance in no two."""
+    replay = _replay_buffer(model)
+    return zlib.crc32(np.ascontiguousarray(replay.actions[: replay.size()]).data)
+
+
+def evaluations_of(callback: BaseCallback | None) -> list[dict[str, Any]]:
+    """Return the evaluations that each ``EvalCallback`` has made so far."""
+    return [
+        {name: np.array(getattr(evaluation, name)).tolist() for name in _EVALUATION}
+        for evaluation in _eval_callbacks(callback)
+    ]
+
+
+def restore_evaluations(callback: BaseCallback | None, saved: list[dict[str, Any]]) -> None:
+    """Give each ``EvalCallback`` what :func:`evaluations_of` returned.
+
+    :raises ValueError: for another number of them
+    :raises SavedFileError: for evaluations other than an EvalCallback's
+    """
+    eval_callbacks = _eval_callbacks(callback)
+    if len(eval_callbacks) != len(saved):
+        raise ValueError(
+            f"the run had {len(saved)} EvalCallback and is resumed with {len(eval_callbacks)}; resume with the "
+            "callbacks of the run"
+        )
+    for kept in saved:
+        _check_evaluation(kept)
+    for eval_callback, kept in zip(eval_callbacks, saved, strict=True):
+        for name in _EVALUATION:
+            setattr(eval_callback, name, kept[name])
 
 
 def restore_training(model: SafeSaveMixin, path: str | Path, callback: BaseCallback | None = None) -> None:
@@ -157,24 +199,19 @@ def restore_training(model: SafeSaveMixin, path: str | Path, callback: BaseCallb
     :raises SavedFileError: when the file is damaged or forged, or does not fit the model
     :raises ValueError: when the model's replay buffer has no ``load_state_dict``
     """
-    replay_buffer, eval_callbacks = _replay_buffer(model), _eval_callbacks(callback)
+    replay_buffer = _replay_buffer(model)
     state = load_tree(path)
     with readable(path, explained=(ValueError,)):
-        if len(eval_callbacks) != len(state["evaluations"]):
-            raise ValueError(
-                f"the run had {len(state['evaluations'])} EvalCallback and is resumed with {len(eval_callbacks)}; "
-                "resume with the callbacks of the run"
-            )
-        for kept in state["evaluations"]:
-            _check_evaluation(kept)
+        restore_evaluations(callback, state["evaluations"])
         _check_random_state(state["random"])
         check_statistics(model.get_vec_normalize_env(), state["vec_normalize"])
+        is_dataset = "checksum" in state["replay_buffer"]
+        if is_dataset and state["replay_buffer"]["checksum"] != checksum(model):
+            raise ValueError("it is of a training on other data; resume with the dataset of the run")
         restore_agent(model, state)
-        replay_buffer.load_state_dict(state["replay_buffer"])
+        if not is_dataset:
+            replay_buffer.load_state_dict(state["replay_buffer"])
         set_statistics(model.get_vec_normalize_env(), state["vec_normalize"])
-        for eval_callback, kept in zip(eval_callbacks, state["evaluations"], strict=True):
-            for name in _EVALUATION:
-                setattr(eval_callback, name, kept[name])
         restore_random_state(state["random"])
     model._last_obs = None  # the replay's newest episode is not the environment's, even where it looks so
     if model.seed is not None and model.env is not None:

@@ -72,6 +72,15 @@ class Dataset:
         starts = np.concatenate([[0], np.flatnonzero(self.ends)[:-1] + 1])
         return np.add.reduceat(self.rewards.astype(np.float64), starts)
 
+    def select(self, keep: np.ndarray) -> Dataset:
+        """Return some of the trajectories.
+
+        :param keep: (n_trajectories,) bool
+        """
+        steps = np.repeat(keep, self.lengths)
+        columns = {field.name: getattr(self, field.name)[steps] for field in fields(self) if field.name != "finals"}
+        return Dataset(**columns, finals=self.finals[keep])
+
     def to_replay(
         self,
         observation_space: spaces.Space[Any],
@@ -148,12 +157,17 @@ def load_dataset(
     return _joined(read)
 
 
+def is_file(source: Any) -> bool:
+    """Tell whether a dataset is meant as the path of a file, by its suffix; other text is an id of Minari."""
+    return isinstance(source, (str, os.PathLike)) and Path(source).suffix in (".hdf5", ".h5", ".npz")
+
+
 def _read(source: Any, state_space: spaces.Box, action_space: spaces.Box, env_id: str | None, bar: bool) -> Dataset:
     if isinstance(source, Dataset):
         return source
     if isinstance(source, ReplayBuffer):
         trajectories, name = _of_buffer(source), type(source).__name__
-    elif isinstance(source, (str, os.PathLike)) and Path(source).suffix in (".hdf5", ".h5", ".npz"):
+    elif is_file(source):
         name = os.fspath(source)
         trajectories = [_of_columns(name, _read_columns(Path(source)))]
     else:

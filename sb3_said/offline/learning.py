@@ -35,7 +35,9 @@ class OfflineAlgorithm(DelayedSAC):
     ) -> SelfOffline:
         """Learn from a dataset. ``num_timesteps`` counts gradient steps, and callbacks are called after each.
 
-        :param dataset: whatever :func:`~sb3_said.offline.load_dataset` reads
+        To them each gradient step is a rollout of one step, so that a ``TrainingCheckpointCallback`` works as online.
+
+        :param dataset: whatever :func:`~sb3_said.offline.load_dataset` reads; None for what :meth:`take_dataset` took
         :param gradient_steps: to make
         :param callback: SB3 callbacks, such as ``EvalCallback``
         :param log_interval: gradient steps between two rows of the log; None for none
@@ -45,7 +47,9 @@ class OfflineAlgorithm(DelayedSAC):
         :raises ValueError: as ``load_dataset`` does
         """
         watcher = self._begin_offline(dataset, gradient_steps, callback, tb_log_name, reset_num_timesteps, progress_bar)
+        watcher.on_training_start(locals() | {"total_timesteps": self._total_timesteps, "callback": watcher}, globals())
         while self.num_timesteps < self._total_timesteps:
+            watcher.on_rollout_start()
             self.train(1, self.batch_size)
             self.num_timesteps += 1
             if log_interval is not None and self.num_timesteps % log_interval == 0:
@@ -64,8 +68,9 @@ class OfflineAlgorithm(DelayedSAC):
         reset_num_timesteps: bool,
         progress_bar: bool,
     ) -> BaseCallback:
-        """Do what SB3's ``_setup_learn`` does, but for the environment, and start the callbacks."""
-        self.take_dataset(dataset, progress_bar)
+        """Do what SB3's ``_setup_learn`` does, but for the environment; return the callbacks, not yet started."""
+        if dataset is not None:
+            self.take_dataset(dataset, progress_bar)
         self.start_time = time.time_ns()
         if reset_num_timesteps:
             self.num_timesteps = 0
@@ -74,9 +79,7 @@ class OfflineAlgorithm(DelayedSAC):
         if not self._custom_logger:
             name = tb_log_name or type(self).__name__
             self._logger = configure_logger(self.verbose, self.tensorboard_log, name, reset_num_timesteps)
-        watcher = self._init_callback(callback, progress_bar)
-        watcher.on_training_start({"self": self, "total_timesteps": self._total_timesteps}, {})
-        return watcher
+        return self._init_callback(callback, progress_bar)
 
     def _goes_on(self, watcher: BaseCallback) -> bool:
         """Call the callbacks after a gradient step; return whether learning goes on."""
@@ -86,6 +89,8 @@ class OfflineAlgorithm(DelayedSAC):
     def take_dataset(self, dataset: Any, progress_bar: bool = False) -> None:
         """Replace the replay buffer by a dataset, whose episodes are seen at the ages that this agent's delay gives.
 
+        A ``VecNormalize`` that learns takes the mean and variance of observations from it.
+
         :param dataset: whatever :func:`~sb3_said.offline.load_dataset` reads
         :param progress_bar: show one
         :raises ValueError: as ``load_dataset`` does
@@ -93,6 +98,10 @@ class OfflineAlgorithm(DelayedSAC):
         spec = None if self.env is None else self.env.get_attr("spec", 0)[0]
         env_id = None if spec is None else spec.id
         data = load_dataset(dataset, self.observation_space, self.action_space, env_id, progress_bar)
+        vec_normalize = self._vec_normalize_env
+        if vec_normalize is not None and vec_normalize.norm_obs and vec_normalize.training:
+            rms = vec_normalize.obs_rms
+            (rms["observation"] if isinstance(rms, dict) else rms).update(data.states)
         self.replay_buffer = data.to_replay(
             self.observation_space,
             self.action_space,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -184,6 +185,21 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
             "scale_rewards": self.scale_rewards,
             "average_actor": self.average_actor,
         }
+
+
+def rows_of(observation: PyTorchObs) -> Iterator[PyTorchObs]:
+    """Yield each row of a batch as a batch of one."""
+    if not isinstance(observation, dict):
+        yield from observation.split(1)
+        return
+    for i in range(len(observation["delay"])):
+        yield {key: value[i : i + 1] for key, value in observation.items()}
+
+
+def seed_of(row: PyTorchObs) -> int:
+    """Return a seed that the observation alone decides, for draws that repeat where it does."""
+    entries = [row[key] for key in sorted(row)] if isinstance(row, dict) else [row]
+    return zlib.crc32(b"".join((entry.cpu().numpy() + 0.0).tobytes() for entry in entries))  # -0.0 is 0.0
 
 
 def as_array(given: Any) -> np.ndarray:

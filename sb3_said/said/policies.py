@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields
@@ -18,7 +17,7 @@ from sb3_said.delays.space import KEYS, STATE_KEYS, UNDELAYED, check_spaces, has
 from sb3_said.offline.iql import ImplicitValues
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner.graphs import EAGER_CALLS
-from sb3_said.sac.policies import DelayedSACPolicy
+from sb3_said.sac.policies import DelayedSACPolicy, rows_of, seed_of
 
 Answer = Literal["planner", "expert"]
 Value = Literal["critics", "iql"]
@@ -156,8 +155,8 @@ class SAIDPolicy(DelayedSACPolicy):
             return self._plan(observation) if who == "planner" else super()._predict(observation)
         # Each row alone: matrix products of another batch size round differently, and can change the candidate chosen.
         if who == "expert":
-            return th.cat([super(SAIDPolicy, self)._predict(row, True) for row in _rows(observation)])
-        return th.cat([self._plan(row, repeats=True) for row in _rows(observation)])
+            return th.cat([super(SAIDPolicy, self)._predict(row, True) for row in rows_of(observation)])
+        return th.cat([self._plan(row, repeats=True) for row in rows_of(observation)])
 
     def _plan(self, observation: PyTorchObs, repeats: bool = False) -> th.Tensor:
         """Return the decision of each row: (B, act_dim).
@@ -190,10 +189,8 @@ class SAIDPolicy(DelayedSACPolicy):
         would favour the same few candidates at every step, and their errors would add up.
         """
         planner = self.planner
-        entries = [row[key] for key in sorted(row)] if isinstance(row, dict) else [row]
-        seed = zlib.crc32(b"".join((entry.cpu().numpy() + 0.0).tobytes() for entry in entries))  # -0.0 is 0.0
         shape = (planner.config.n_candidates, planner.window_length, planner.obs_dim + planner.act_dim)
-        return th.randn(shape, generator=th.Generator().manual_seed(seed))
+        return th.randn(shape, generator=th.Generator().manual_seed(seed_of(row)))
 
     def warmup(self, batch_size: int = 1) -> None:
         """Run a few dummy predictions, so that the next decision takes no longer than any later one.
@@ -227,12 +224,3 @@ class SAIDPolicy(DelayedSACPolicy):
             "planner_kwargs": self.planner.config.to_dict(),
             "value": "critics" if self.values is None else "iql",
         }
-
-
-def _rows(observation: PyTorchObs) -> Iterator[PyTorchObs]:
-    """Yield each row of a batch as a batch of one."""
-    if not isinstance(observation, dict):
-        yield from observation.split(1)
-        return
-    for i in range(len(observation["delay"])):
-        yield {key: value[i : i + 1] for key, value in observation.items()}

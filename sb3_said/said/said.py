@@ -320,7 +320,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         No environment is stepped and no expert is trained; the planner serves every delay 0..D. Callbacks are called
         after each update, and meet a planner that is at most 100 updates old. ``num_timesteps`` counts updates.
 
-        :param dataset: whatever :func:`~sb3_said.offline.load_dataset` reads
+        :param dataset: whatever :func:`~sb3_said.offline.load_dataset` reads; None for what ``take_dataset`` took
         :param gradient_steps: ``planner_gradient_steps`` by default
         :param callback: SB3 callbacks, such as ``EvalCallback``
         :param log_interval: updates between two rows of losses in the log
@@ -335,12 +335,14 @@ class SAID(OfflineAlgorithm, StableSAC):
         :raises ValueError: as ``load_dataset`` and :meth:`train_planner` do
         """
         total = self.planner_gradient_steps if gradient_steps is None else gradient_steps
-        self.value = "iql"
+        self.value, self.planner_newest_fraction = "iql", 1.0  # no step of a log is newer than another
         self.policy.set_value("iql")
         watcher = self._begin_offline(dataset, total, callback, tb_log_name, True, progress_bar)
         trainer, values = self.make_planner_trainer(total), self._make_value_trainer()
         intervals = log_interval, eval_interval, save_interval
-        training = PlannerTraining(self, trainer, values, lambda n_updates: n_updates, folder, *intervals)
+        training = PlannerTraining(self, trainer, values, lambda n_updates: n_updates, folder, *intervals, watcher)
+        self.num_timesteps = trainer.n_updates
+        watcher.on_training_start(locals() | {"total_timesteps": total, "callback": watcher}, globals())
 
         def on_step(n_updates: int) -> bool:
             self.num_timesteps = n_updates

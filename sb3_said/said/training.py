@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import warnings
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
 import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from tqdm.auto import tqdm
 
 from sb3_said.files.archive import load_tree, readable, save_tree
+from sb3_said.files.checkpoint import checksum, evaluations_of, restore_evaluations
 from sb3_said.offline.iql import IQL
 from sb3_said.planner.trainer import PlannerTrainer, worse_than_regression
 
@@ -32,6 +33,7 @@ class PlannerTraining:
     :param log_interval: updates between two rows of losses in the log
     :param eval_interval: updates between two measurements of the held-out errors, beside the regression's
     :param save_interval: updates between two checkpoints
+    :param watcher: whose ``EvalCallback`` evaluations the checkpoint keeps, too
     :raises SavedFileError: when the checkpoint is damaged, or of a training with other settings
     """
 
@@ -45,12 +47,13 @@ class PlannerTraining:
         log_interval: int = 500,
         eval_interval: int = 2_000,
         save_interval: int = 1_000,
+        watcher: BaseCallback | None = None,
     ):
         self.model, self.trainer, self.values, self.row = model, trainer, values, row
         self.log_interval, self.eval_interval, self.save_interval = log_interval, eval_interval, save_interval
         self.checkpoint = None if folder is None else Path(folder) / PLANNER_CHECKPOINT_NAME
-        replay = model.replay_buffer.actions[: model.replay_buffer.size()]
-        self._data = {"num_timesteps": model.num_timesteps, "replay": zlib.crc32(replay.data)}
+        self.watcher = watcher
+        self._data = {"num_timesteps": model.num_timesteps, "replay": checksum(model)}
         self._value_losses: dict[str, th.Tensor] = {}  # of the last update; read at log times only
         if self.checkpoint is not None and self.checkpoint.exists():
             state = load_tree(self.checkpoint)
@@ -59,6 +62,7 @@ class PlannerTraining:
                     trainer.load_state_dict(state["trainer"])
                     if values is not None:
                         values.load_state_dict(state["values"])
+                    restore_evaluations(watcher, state.get("evaluations", []))
 
     def run(
         self,
@@ -83,10 +87,11 @@ class PlannerTraining:
             self._train_values()
             if done % self.log_interval == 0 or is_end:
                 bar.set_postfix(loss=self._log_row(done % self.eval_interval == 0 or is_end))
+            goes_on = on_step is None or on_step(done)  # first: a checkpoint keeps what callbacks counted
             outcome = "stopped" if should_stop is not None and should_stop() else "done"
             if self.checkpoint is not None and (done % self.save_interval == 0 or is_end or outcome == "stopped"):
                 self._save_or_warn(self.checkpoint)
-            return outcome == "done" and (on_step is None or on_step(done))
+            return outcome == "done" and goes_on
 
         with tqdm(total=total, initial=trainer.n_updates, desc="planner", disable=not progress_bar) as bar:
             try:
@@ -142,8 +147,9 @@ class PlannerTraining:
     def _save_or_warn(self, checkpoint: Path) -> None:
         """Write a checkpoint; a full disk is no reason to lose the planner itself."""
         values = None if self.values is None else self.values.state_dict()
+        state = {**self._data, "trainer": self.trainer.state_dict(), "values": values}
         try:
-            save_tree(checkpoint, {**self._data, "trainer": self.trainer.state_dict(), "values": values})
+            save_tree(checkpoint, {**state, "evaluations": evaluations_of(self.watcher)})
         except OSError as error:
             warnings.warn(
                 f"The planner's checkpoint could not be written to {checkpoint} ({error}). Training goes on, and the "

@@ -35,12 +35,15 @@ def add_delay(parser: argparse.ArgumentParser, default: str, name: str = "--dela
     parser.add_argument(name, nargs="+", default=[], metavar="STEPS", help=f"{help} (default: {default})")
 
 
-def add_playing(parser: argparse.ArgumentParser, episodes: int) -> None:
-    """Give a command line the options of how trained agents play."""
+def add_playing(parser: argparse.ArgumentParser, episodes: int | None, seed: int = 10_000) -> None:
+    """Give a command line the options of how trained agents play; without a number of episodes, no option of it."""
     parser.add_argument("--algo", help="algorithm of a .zip without its run folder")
     parser.add_argument("--env", help="task to play (default: the trained one)")
-    parser.add_argument("--episodes", type=int, default=episodes, help=f"whole episodes to play (default: {episodes})")
-    parser.add_argument("--seed", type=int, default=10_000, help="reset seed of the first episode (default: 10000)")
+    if episodes is not None:
+        parser.add_argument(
+            "--episodes", type=int, default=episodes, help=f"whole episodes to play (default: {episodes})"
+        )
+    parser.add_argument("--seed", type=int, default=seed, help=f"reset seed of the first episode (default: {seed})")
     parser.add_argument("--device", default="auto", help="torch device (default: auto)")
     parser.add_argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules to import that "
                         "register the task, beside those that its run remembers")  # fmt: skip

@@ -15,6 +15,7 @@ usage: sb3-said COMMAND ...
   tune         search the planner's depth, temperature, denoising steps and choice factor for a trained run
   decide       set how a trained agent decides: temperature, candidates, denoising steps, choice factor
   card         write a model card for an agent's file, from what was measured of it
+  collect      let trained agents play, and log it as a dataset to learn from
 
 sb3-said COMMAND --help shows the options of a command, with examples. A first try,
 of a few minutes (five on two slow cores):
@@ -22,7 +23,7 @@ of a few minutes (five on two slow cores):
   sb3-said train --algo said --env Pendulum-v1 --delay 2 --preset smoke --seed 1
   sb3-said evaluate logs/said/Pendulum-v1-delay2-seed1_1
 """
-COMMANDS = ("train", "evaluate", "enjoy", "over-delays", "tune", "decide", "card")
+COMMANDS = ("train", "evaluate", "enjoy", "over-delays", "tune", "decide", "card", "collect")
 
 
 def main() -> None:

@@ -29,6 +29,7 @@ class DepthPlanners:
     :param folder: for the planners
     :param gradient_steps: updates of each planner; the agent's ``planner_gradient_steps`` by default
     :param progress_bar: show one while training
+    :param dataset: logs that the run learned from, in the checkpoint's place
     """
 
     def __init__(
@@ -38,7 +39,9 @@ class DepthPlanners:
         folder: Path,
         gradient_steps: int | None = None,
         progress_bar: bool = False,
+        dataset: Sequence[str] = (),
     ):
+        self.dataset = dataset
         self.model, self.checkpoint, self.folder, self.progress_bar = model, checkpoint, folder, progress_bar
         self.gradient_steps = gradient_steps or model.planner_gradient_steps
         self.config = model.policy.planner.config
@@ -107,6 +110,9 @@ class DepthPlanners:
         buffer = self.model.replay_buffer
         if buffer.size() > 0:
             return
+        if self.dataset:
+            self.model.take_dataset([*self.dataset], self.progress_bar)
+            return
         state = load_tree(self.checkpoint)
         with readable(self.checkpoint, explained=(ValueError,)):
             steps = state["counters"]["num_timesteps"]
@@ -123,7 +129,12 @@ class DepthPlanners:
         log = make_output_format("csv", str(folder), log_suffix(folder, 0))
         self.model.set_logger(Logger(str(folder), [log]))
         print(f"Training the planner of depth {depth}: {self.gradient_steps} updates", flush=True)
-        self.model.train_planner(self.gradient_steps, folder, self.progress_bar)
+        policy = self.model.policy
+        values, policy.values = policy.values, None  # all depths share that of the run
+        try:
+            self.model.train_planner(self.gradient_steps, folder, self.progress_bar)
+        finally:
+            policy.values = values
         self.model.logger.close()
         if int(self.model.policy.planner_updates) < self.gradient_steps:
             raise KeyboardInterrupt  # what was learned is kept, but half a planner serves no comparison

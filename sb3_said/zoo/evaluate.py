@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,12 +13,13 @@ from tqdm import tqdm
 
 from sb3_said.evaluation import Summary, collect_observations, measure_latency, plots
 from sb3_said.files.atomic import write_json
+from sb3_said.offline import normalized_score, reference_returns
 from sb3_said.zoo.arguments import TRUST, add_run, check_positive, explained, make_parser, read_delay
 from sb3_said.zoo.runs import LoadedRun, answering, answers, load_run, origin
 
 EPILOG = f"""\
 examples:
-  # 20 episodes of the planner, and of the expert beside it; writes evaluation.json into the run folder
+  # 50 episodes of the planner, and of the expert beside it; writes evaluation.json into the run folder
   sb3-said evaluate logs/said/Hopper-v5-delay4-seed1_1
 
   # the expert that did best in training, under a shorter delay
@@ -26,15 +29,17 @@ examples:
   sb3-said evaluate hopper.zip --algo said --env Hopper-v5 --delay 4
 
 Episode i starts from reset seed --seed + i, so two agents meet the same starts; --n-envs changes only the speed. A
-return is the undiscounted sum of the task's own rewards. Decisions are timed after the episodes, one at a time, from
-NumPy observation to NumPy action.
+return is the undiscounted sum of the task's own rewards, and a score is D4RL's, 0 for a random policy and 100 for an
+expert, where D4RL has both. Decisions are timed after the episodes, one at a time, from NumPy observation to NumPy
+action. The last agent of a run is played, and where an earlier one did best in training, that "best" one too: it was
+chosen on other episodes than these.
 {TRUST}
 """
 
 
 def main(argv: list[str] | None = None) -> None:
     parser = make_parser(__doc__, EPILOG)
-    add_run(parser, episodes=20)
+    add_run(parser, episodes=50)
     parser.add_argument("--n-envs", type=int, default=8, help="episodes played side by side (default: 8)")
     parser.add_argument("--latency-calls", type=int, default=200, help="decisions to time, 0 for none (default: 200)")
     parser.add_argument("--json", type=Path, help="where to write the numbers (default: RUN/evaluation.json)")
@@ -45,24 +50,38 @@ def main(argv: list[str] | None = None) -> None:
         th.set_num_threads(args.num_threads)
         if args.plot is not None:
             plots.panels()  # without matplotlib, fail now and not after the episodes
-        run = load_run(
-            args.run, args.algo, args.env, read_delay(args.delay), args.device, gym_packages=args.gym_packages
-        )
+        how_played = args.algo, args.env, read_delay(args.delay), args.device, None, args.gym_packages
+        run = load_run(args.run, *how_played)
+        runs = {"last": run}
+        if Path(args.run).is_dir() and (best := run.folder / "best_model.zip").is_file():
+            runs["best"] = load_run(best, *how_played)
+            if runs["best"].info["trained_steps"] == run.info["trained_steps"]:
+                del runs["best"]  # the last one is the best
 
     last_seed = args.seed + args.episodes - 1
     print(f"{run.info['algo']} on {run.info['env']}, delay {run.info['delay']}, reset seeds {args.seed}..{last_seed}")
     settings = {"seed": args.seed, "n_envs": args.n_envs, "deterministic": not args.stochastic}
     how = {**settings, "latency_calls": args.latency_calls}
-    summaries = [evaluate(run, answer, args.episodes, **how) for answer in answers(run.model)]
-    print_table(summaries)
+    played = [
+        (which, evaluate(one, answer, args.episodes, **how))
+        for which, one in runs.items()
+        for answer in answers(one.model)
+    ]
+    rows = [replace(s, label=s.label if which == "last" else f"{s.label}, best") for which, s in played]
+    print_table(rows, run.info["env"])
 
     document = {**run.info, "n_episodes": args.episodes, **settings}
-    document |= {"results": [summary.to_dict() for summary in summaries], "origin": origin(run)}
+    document["results"] = [
+        {**summary.to_dict(), "which": which, "trained_steps": runs[which].info["trained_steps"]}
+        | {"normalized_score": score_of(summary, run.info["env"])}
+        for which, summary in played
+    ]
+    document["origin"] = origin(run)
     target = args.json or run.folder / "evaluation.json"
     write_json(target, document)
     print(f"Wrote {target}")
     if args.plot is not None:
-        draw(args.plot, summaries, run.folder, f"{run.info['algo']} on {run.info['env']}, delay {run.info['delay']}")
+        draw(args.plot, rows, run.folder, f"{run.info['algo']} on {run.info['env']}, delay {run.info['delay']}")
         print(f"Wrote {args.plot}")
 
 
@@ -87,13 +106,29 @@ def evaluate(
     return Summary.from_episodes(label, played.returns, played.lengths, latency, *measured)
 
 
-def print_table(summaries: list[Summary]) -> None:
-    """Print one line for each answer."""
-    print(f"{'':10} {'mean return':>12} {'95 % interval':>24} {'length':>8}   decision latency")
+def score_of(summary: Summary, env_id: str) -> list[float] | None:
+    """Return D4RL's score of the mean return and of its interval's ends, None where there is none."""
+    if reference_returns(env_id) is None:
+        return None
+    mean = summary.mean_return
+    ends = [mean.value] if math.isnan(mean.low) else [mean.value, mean.low, mean.high]
+    return [float(normalized_score(end, env_id)) for end in ends]
+
+
+def print_table(summaries: list[Summary], env_id: str = "") -> None:
+    """Print one line for each answer.
+
+    :param env_id: of a task, for the score
+    """
+    print(f"{'':15} {'mean return':>12} {'95 % interval':>24} {'score':>7} {'length':>8}   decision latency")
     for s in summaries:
         interval = f"[{s.mean_return.low:,.1f}, {s.mean_return.high:,.1f}]"
         speed = "not measured" if s.latency is None else str(s.latency)
-        print(f"{s.label:10} {s.mean_return.value:12,.1f} {interval:>24} {s.mean_length.value:8,.1f}   {speed}")
+        scores = score_of(s, env_id)
+        score = "-" if scores is None else f"{scores[0]:.1f}"
+        print(
+            f"{s.label:15} {s.mean_return.value:12,.1f} {interval:>24} {score:>7} {s.mean_length.value:8,.1f}   {speed}"
+        )
 
 
 def draw(path: Path, summaries: list[Summary], folder: Path, title: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,8 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from sb3_said import SAID, DelayedSAC, PlannerTrainingCallback, StableSAC
 from sb3_said.files.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback, restore_training
 from sb3_said.files.normalization import load_normalization, normalization_file, save_normalization
+from sb3_said.offline import BC, DQL, OfflineAlgorithm
+from sb3_said.offline.datasets import is_file
 from sb3_said.zoo.answer import EXPERT_FOLDER, evaluate_answer
 from sb3_said.zoo.arguments import Delay, largest_delay
 from sb3_said.zoo.folder import claim_folder, drop_undone_episodes, hold_folder, log_suffix
@@ -35,6 +38,8 @@ ALGORITHMS: dict[str, tuple[type[DelayedSAC], dict[str, bool]]] = {
     "dr": (DelayedSAC, {"augment_state": False, "delay_reconciled_critic": True}),
     "sadr": (DelayedSAC, {"augment_state": True, "delay_reconciled_critic": True}),
     "stable": (StableSAC, {}),
+    "bc": (BC, {}),
+    "dql": (DQL, {}),
 }
 for _name, (_class, _) in ALGORITHMS.items():
     ALGOS[_name] = _class
@@ -52,6 +57,7 @@ class Run:
     :param resume: folder of the run to continue
     :param expert_delay: what the expert learns under, ``delay`` by default; the planner serves ``delay`` in any case
     :param record: of the run to continue
+    :param dataset: logs to learn from instead of an environment: paths, and ids of Minari datasets
     """
 
     delay: Delay
@@ -60,13 +66,16 @@ class Run:
     resume: Path | None = None
     expert_delay: Delay = None
     record: Record | None = None
+    dataset: Sequence[str] = ()
 
     @property
-    def delay_name(self) -> str:
-        """Name of the delays in paths, e.g. ``-delay4``, ``-delayUniformDelay-0-8`` or ``-delay0-8-expert0``."""
+    def name(self) -> str:
+        """What paths say of it, e.g. ``-delay4``, ``-delayUniformDelay-0-8``, ``-delay0-8-expert0``, ``-medium-v0``."""
         parts = [("delay", self.delay), ("expert", self.expert_delay)]
         words = {name: "-".join(re.findall(r"[\w.]+", str(delay))) for name, delay in parts if delay is not None}
-        return "".join(f"-{name}{text}" for name, text in words.items())
+        logs = [Path(source).stem if is_file(source) else source.rpartition("/")[2] for source in self.dataset]
+        plain = [re.sub(r"[^\w.-]+", "-", log) for log in logs]
+        return "".join(f"-{name}{text}" for name, text in words.items()) + "".join(f"-{log}" for log in plain)
 
     @property
     def max_delay(self) -> int:
@@ -82,13 +91,16 @@ class DelayedExperimentManager(ExperimentManager):
     :raises ValueError: for a run that another process trains, or that cannot go on
     """
 
+    LOG_INTERVAL = 4  # episodes
+
     def __init__(self, run: Run, args: argparse.Namespace, algo: str, env_id: str, *zoo_args: Any, **zoo_kwargs: Any):
-        zoo_kwargs["config"] = zoo_kwargs.get("config") or str(config_file(algo))
+        zoo_kwargs["config"] = zoo_kwargs.get("config") or str(config_file(algo, bool(run.dataset)))
         super().__init__(args, algo, env_id, *zoo_args, **zoo_kwargs)
-        if algo == "said" and self.optimize_hyperparameters:
+        if issubclass(ALGORITHMS[algo][0], OfflineAlgorithm) and self.optimize_hyperparameters:
             raise ValueError(
-                "-optimize scores the expert alone, and would train a planner in each trial for nothing. Search the "
-                "expert's settings with --algo sadr -optimize, and the planner's with sb3-said tune on a trained run."
+                "-optimize scores an expert in its environment, and would train a planner in each trial for nothing. "
+                "Search the expert's settings with --algo sadr -optimize, and the planner's with sb3-said tune on a "
+                "trained run."
             )
         self.run = run
         self.stopping = Stopping()
@@ -104,7 +116,7 @@ class DelayedExperimentManager(ExperimentManager):
             self.env_kwargs = {**run.record.env_kwargs, **self.env_kwargs}
             self.eval_env_kwargs = {**run.record.eval_env_kwargs, **self.eval_env_kwargs}
         else:
-            overrides = preset_overrides(self.config, run.preset, env_id, run.delay, run.max_delay)
+            overrides = preset_overrides(self.config, run.preset, env_id, run.delay, run.max_delay, run.dataset)
             self.custom_hyperparams = {**overrides, **ALGORITHMS[algo][1], **given}
 
     def release(self) -> None:
@@ -163,7 +175,7 @@ class DelayedExperimentManager(ExperimentManager):
 
     def create_log_folder(self) -> None:
         if self.lock is None:
-            name = f"{self.env_name}{self.run.delay_name}-seed{self.seed}"
+            name = f"{self.env_name}{self.run.name}-seed{self.seed}"
             self._set_folder(claim_folder(Path(self.log_path), name, self._uuid))
             self.lock = hold_folder(self.folder)
         super().create_log_folder()
@@ -186,19 +198,26 @@ class DelayedExperimentManager(ExperimentManager):
             self.eval_env_kwargs,
             hyperparams,
             options_of(self.args),
+            dataset=[*self.run.dataset],
         ).write(self.folder)
 
     def create_callbacks(self) -> None:
         super().create_callbacks()
         self.evaluation = next((c for c in self.callbacks if isinstance(c, EvalCallback)), None)
-        if self.evaluation is not None and self.algo == "said":
-            expert = self.folder / EXPERT_FOLDER
-            self.evaluation.log_path, self.evaluation.best_model_save_path = f"{expert}/evaluations", str(expert)
+        self._set_evaluation()
         if self.evaluation is not None:
             self.evaluation.callback_on_new_best = SaveNormalization(
                 normalization_file(Path(str(self.evaluation.best_model_save_path), "best_model.zip")),
                 self.evaluation.callback_on_new_best,
             )
+        self._add_checkpoints()
+
+    def _set_evaluation(self) -> None:
+        if self.evaluation is not None and self.algo == "said":
+            expert = self.folder / EXPERT_FOLDER
+            self.evaluation.log_path, self.evaluation.best_model_save_path = f"{expert}/evaluations", str(expert)
+
+    def _add_checkpoints(self) -> None:
         self.checkpointing = TrainingCheckpointCallback(self.folder, self.run.checkpoint_freq, self.stopping)
         self.callbacks.append(self.checkpointing)
         if self.algo == "said":
@@ -219,22 +238,16 @@ class DelayedExperimentManager(ExperimentManager):
         taken = model.num_timesteps if resumes else 0  # learn() counts the steps of an agent given with -i anew
         model.set_logger(self._logger(taken))
         # rl_zoo3: -1 is the default, anything below logs nothing by itself
-        log_interval = {-1: 4}.get(self.log_interval, self.log_interval if self.log_interval > 0 else None)
+        log_interval = {-1: self.LOG_INTERVAL}.get(self.log_interval, max(self.log_interval, 0) or None)
+        how = {"callback": self.callbacks, "log_interval": log_interval, "reset_num_timesteps": not resumes}
         try:
             with self.stopping.listening():
-                model.learn(
-                    max(self.n_timesteps - taken, 0),
-                    callback=self.callbacks,
-                    log_interval=log_interval,  # type: ignore[arg-type]  # SB3 takes None and says so in its docstring
-                    reset_num_timesteps=not resumes,
-                )
+                self._learn(model, max(self.n_timesteps - taken, 0), **how)
                 if self.stopping.is_asked:
                     raise KeyboardInterrupt
-                if isinstance(model, SAID) and model.policy.planner_is_trained and self.evaluation is not None:
-                    evaluate_answer(model, self.evaluation, self.folder, self.stopping)
         except KeyboardInterrupt:
             self.stopping.is_asked = True
-            written = not self.stopping.is_forced and self.checkpointing.save()
+            written = not self.stopping.is_forced and self._save_checkpoint()
             state = "and wrote a checkpoint" if written else "without a checkpoint of this step"
             print(f"Interrupted at step {model.num_timesteps} {state}; go on with --resume {self.save_path}")
         except Exception:
@@ -244,6 +257,17 @@ class DelayedExperimentManager(ExperimentManager):
         finally:
             if model.env is not None:
                 model.env.close()
+
+    def _learn(self, model: Any, steps: int, **how: Any) -> None:
+        """Learn for so many steps, and evaluate the planner where there is one."""
+        model.learn(steps, **how)
+        is_answer = isinstance(model, SAID) and model.policy.planner_is_trained
+        if is_answer and self.evaluation is not None and not self.stopping.is_asked:
+            evaluate_answer(model, self.evaluation, self.folder, self.stopping)
+
+    def _save_checkpoint(self) -> bool:
+        """Write a checkpoint of a training that is asked to stop; return whether the file has it all."""
+        return self.checkpointing.save()
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         super().save_trained_model(model)

@@ -66,7 +66,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--rows", nargs="+", metavar="ROW[=NAME]", help="rows of table and plot, in this order: "
                         "each a label, or 'LABEL planner' or 'LABEL expert' of a SAID agent, shown as NAME (default: "
                         "all)")  # fmt: skip
-    add_playing(parser, episodes=20)
+    add_playing(parser, episodes=50)
     parser.add_argument("--n-envs", type=int, default=8, help="episodes played side by side (default: 8)")
     parser.add_argument("--workers", type=int, default=1, help="cells played at once, in processes (default: 1)")
     args = parser.parse_args(argv)

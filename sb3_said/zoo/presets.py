@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,22 +17,36 @@ _INSTALLED = Path(__file__).parent / "configs"  # where the wheel puts what a cl
 CONFIGS = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).resolve().parents[2] / "zoo_configs"
 
 
-def config_file(algo: str) -> Path:
-    """Return the YAML file of an algorithm; SAC, SA, DR and SADR share one."""
-    return CONFIGS / ("said.yml" if algo == "said" else "delayed_sac.yml")
+def config_file(algo: str, offline: bool = False) -> Path:
+    """Return the YAML file of an algorithm; SAC, SA, DR and SADR share one, and SAID has another for logs."""
+    names = {"said": "said_offline.yml" if offline else "said.yml", "bc": "bc.yml", "dql": "dql.yml"}
+    return CONFIGS / names.get(algo, "delayed_sac.yml")
+
+
+def dataset_kind(dataset: Sequence[str]) -> str:
+    """Return which of D4RL's kinds a dataset is by its name: medium-expert, medium-replay, or else medium."""
+    name = " ".join(dataset).lower()
+    return "medium-replay" if "replay" in name else "medium-expert" if "expert" in name else "medium"
 
 
 def preset_overrides(
-    config: str | Path, preset: str, env_id: str, delay: Delay, max_delay: int | None = None
+    config: str | Path,
+    preset: str,
+    env_id: str,
+    delay: Delay,
+    max_delay: int | None = None,
+    dataset: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Return what a preset changes for a task: its own entry of ``presets:`` in the file, or the preset's default.
 
     ``cpu`` changes nothing of the file's block for the task: the constructors' defaults, and a
     ``planner_terminal_penalty`` for tasks that end by falling. Two keys are for planners: ``planner_kwargs: {base:
     paper, ...}`` starts from ``PlannerConfig.paper()``, and ``planner_by_delay`` holds settings to add, by the largest
-    delay and under ``varies`` for delays that are not one number.
+    delay and under ``varies`` for delays that are not one number; ``planner_by_dataset`` has such for each kind of
+    dataset.
 
     :param max_delay: length of the action history, the largest of ``delay`` by default; a longer one varies, too
+    :param dataset: logs to learn from, whose names tell their kind
     :raises ValueError: for a preset the file does not have
     """
     if preset == "cpu":
@@ -40,7 +55,8 @@ def preset_overrides(
     if preset not in presets:
         raise ValueError(f"{config} has no preset '{preset}', only {['cpu', *presets]}.")
     overrides = dict(presets[preset].get(env_id, presets[preset]["default"]))
-    by_delay = overrides.pop("planner_by_delay", {})
+    by_kind = overrides.pop("planner_by_dataset", {}).get(dataset_kind(dataset), {})
+    by_delay = {**overrides.pop("planner_by_delay", {}), **by_kind}
     planner = dict(overrides.get("planner_kwargs", {}))
     if planner.pop("base", None) == "paper":
         planner = {**PlannerConfig.paper().to_dict(), **planner}

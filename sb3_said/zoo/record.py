@@ -47,6 +47,7 @@ class Record:
     :param gym_packages: modules that register the task
     :param options: of rl_zoo3's command line
     :param missing: hyper-parameters that no plain file can hold, each with the reason
+    :param dataset: logs that it learned from instead of an environment
     """
 
     algo: str
@@ -62,6 +63,7 @@ class Record:
     hyperparams: dict[str, Any] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
     missing: dict[str, str] = field(default_factory=dict)
+    dataset: list[str] = field(default_factory=list)
 
     @property
     def agent_name(self) -> str:

@@ -176,10 +176,14 @@ def delay_name(process: DelayProcess) -> int | str:
 
 
 def answers(model: BaseAlgorithm) -> list[str | None]:
-    """Return who can answer: SAID's expert, and its planner once that is trained; None for another agent alone."""
+    """Return who can answer: SAID's planner once it is trained, and its expert; None for another agent alone.
+
+    An expert that made no update, as after learning from logs, answers only where there is nobody else.
+    """
     if not hasattr(model.policy, "answering"):
         return [None]
-    return [who for who in ANSWERS if who != "planner" or model.policy.planner_is_trained]
+    learned = {"planner": model.policy.planner_is_trained, "expert": model._n_updates > 0}
+    return [who for who in ANSWERS if learned[who]] or ["expert"]
 
 
 def answering(model: BaseAlgorithm, answer: str | None) -> AbstractContextManager[Any]:
@@ -211,7 +215,7 @@ def origin(run: LoadedRun) -> dict[str, Any]:
         "command": f"{program} {shlex.join(sys.argv[1:])}",
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} CPU cores",
-        "device": str(run.model.device),
+        "device": str(getattr(run.model, "device", "cpu")),  # random actions have none
         "torch_threads": th.get_num_threads(),
         "versions": {"python": platform.python_version(), "sb3_said": __version__, **{p: version(p) for p in packages}},
     }

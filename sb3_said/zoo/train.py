@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import secrets
 import sys
 from pathlib import Path
@@ -10,8 +11,11 @@ from typing import Any
 
 import rl_zoo3.train
 
-from sb3_said.zoo.arguments import add_delay, explained, make_parser, read_delay
+from sb3_said.offline import OfflineAlgorithm
+from sb3_said.offline.datasets import is_file
+from sb3_said.zoo.arguments import Delay, add_delay, explained, make_parser, read_delay
 from sb3_said.zoo.manager import ALGORITHMS, ALGOS, DelayedExperimentManager, Run
+from sb3_said.zoo.offline import OfflineExperimentManager
 from sb3_said.zoo.presets import PRESETS
 from sb3_said.zoo.record import Record
 
@@ -23,6 +27,10 @@ examples:
   sb3-said train --algo said --env Hopper-v5 --delay "DroppedPackets(UniformDelay(0, 8), p=0.1)"
   sb3-said train --algo said --env Hopper-v5 --delay 0 16 --expert-delay 0
   sb3-said train --resume logs/said/Hopper-v5-delay4-seed1_1
+
+  # from logs, without an environment's steps; -n counts gradient steps, and evaluations alone play episodes
+  sb3-said train --algo said --env Hopper-v5 --delay 0 16 --dataset mujoco/hopper/medium-v0 -n 100000
+  sb3-said train --algo bc --env Hopper-v5 --delay 4 --dataset mine.npz yours.hdf5
 
 Runs go to LOG_FOLDER/ALGO/ENV-delayN-seedS_K (-f sets LOG_FOLDER); sb3-said evaluate and sb3-said enjoy take that
 folder. Ctrl-C, SIGTERM and SIGHUP write a checkpoint before they end the training; --resume goes on from there.
@@ -40,6 +48,9 @@ def own_parser() -> argparse.ArgumentParser:
     add_delay(
         parser, "that of --delay", "--expert-delay", "delay that SAID's expert learns under; the planner serves --delay"
     )
+    parser.add_argument("--dataset", nargs="+", default=[], metavar="ID_OR_FILE", help="logs to learn from instead of "
+                        "an environment, with --algo said, bc or dql: ids of Minari datasets, D4RL's .hdf5 files, .npz "
+                        "files; -n then counts gradient steps")  # fmt: skip
     parser.add_argument(
         "--preset",
         choices=PRESETS,
@@ -66,7 +77,8 @@ def main(argv: list[str] | None = None) -> None:
 
     def make_manager(*args: Any, **kwargs: Any) -> DelayedExperimentManager:
         with explained(parser):
-            made.append(DelayedExperimentManager(run, *args, **kwargs))
+            manager = OfflineExperimentManager if run.dataset else DelayedExperimentManager
+            made.append(manager(run, *args, **kwargs))
         return made[0]
 
     rl_zoo3.train.ExperimentManager = make_manager  # type: ignore[misc,assignment]
@@ -85,8 +97,8 @@ def read_command_line(argv: list[str]) -> tuple[Run, str, list[str]]:
     """Return what the command line adds to rl_zoo3's, the algorithm, and what is left for rl_zoo3.
 
     :param argv: with ``--resume``, what changes in the command line that the run was started with
-    :raises ValueError: for a folder without a run, a bad delay, an expert's delay without a planner, or a resume of
-        another task
+    :raises ValueError: for a folder without a run, a bad delay, an expert's delay without a planner, a dataset that the
+        algorithm does not learn from or lacks, or a resume of another task
     """
     options, zoo_argv = own_parser().parse_known_args(argv)
     zoo_argv = [*joined_settings(zoo_argv), *(["--help"] if options.help else [])]
@@ -94,19 +106,36 @@ def read_command_line(argv: list[str]) -> tuple[Run, str, list[str]]:
     if options.resume is not None:
         record = Record.read(options.resume)
         fixed = {"--algo": options.algo, "--delay": delay, "--expert-delay": expert_delay, "--preset": options.preset}
-        fixed |= {"--seed": options.seed, "--env": options.env}
+        fixed |= {"--seed": options.seed, "--env": options.env, "--dataset": options.dataset or None}
         if given := [name for name, value in fixed.items() if value is not None]:
             raise ValueError(f"--resume goes on with the run's own {', '.join(given)}: leave them out.")
         freq = record.checkpoint_freq if options.checkpoint_freq is None else options.checkpoint_freq
-        run = Run(record.delay, record.preset, freq, options.resume, record.expert_delay, record)
+        run = Run(record.delay, record.preset, freq, options.resume, record.expert_delay, record, record.dataset)
         return run, record.algo, [*record.command_line(), *zoo_argv]
     algo = options.algo or "said"
     if expert_delay is not None and (algo != "said" or delay is None):
         raise ValueError("--expert-delay needs --algo said and a --delay: an agent without a planner is its expert.")
+    check_dataset(algo, options.dataset, expert_delay)
     # Four digits: they are in the folder's name. Evaluation and tuning take reset seeds from 10,000 on.
     seed = secrets.randbelow(10_000) if options.seed is None or options.seed < 0 else options.seed
-    run = Run(delay, options.preset or "cpu", options.checkpoint_freq, None, expert_delay)
+    dataset = [os.path.abspath(source) if is_file(source) else source for source in options.dataset]
+    run = Run(delay, options.preset or "cpu", options.checkpoint_freq, None, expert_delay, None, dataset)
     return run, algo, [f"--env={options.env or 'Pendulum-v1'}", f"--seed={seed}", *zoo_argv]
+
+
+def check_dataset(algo: str, dataset: list[str], expert_delay: Delay) -> None:
+    """
+    :raises ValueError: unless the algorithm learns from what it was given, logs or an environment
+    """
+    learners = [name for name, (cls, _) in ALGORITHMS.items() if issubclass(cls, OfflineAlgorithm)]
+    if dataset and algo not in learners:
+        raise ValueError(f"--dataset is for --algo {', '.join(learners)}: {algo} learns from its own steps.")
+    if not dataset and algo in learners and algo != "said":
+        raise ValueError(f"--algo {algo} learns from logs: name them with --dataset. sb3-said collect makes some.")
+    if dataset and expert_delay is not None:
+        raise ValueError("--expert-delay has no effect with --dataset, from which no expert is trained: leave it out.")
+    if missing := [source for source in dataset if is_file(source) and not os.path.isfile(source)]:
+        raise ValueError(f"--dataset names {', '.join(missing)}, which is not there.")
 
 
 def joined_settings(argv: list[str]) -> list[str]:

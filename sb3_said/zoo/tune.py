@@ -24,7 +24,8 @@ from sb3_said.zoo.arguments import TRUST, check_positive, explained, make_parser
 from sb3_said.zoo.best import write_best
 from sb3_said.zoo.depths import DepthPlanners
 from sb3_said.zoo.evaluate import evaluate, print_table
-from sb3_said.zoo.runs import ANSWERS, LoadedRun, load_run, origin
+from sb3_said.zoo.record import Record
+from sb3_said.zoo.runs import LoadedRun, answers, load_run, origin
 from sb3_said.zoo.search import DRAWN, describe, find_winner, finished, open_study, returns_of, save_plot, search
 
 EPILOG = f"""\
@@ -124,7 +125,8 @@ def tune(args: argparse.Namespace) -> None:
     began = time.monotonic()
     run, model = open_run(args)
     folder = args.output or args.run / "tune"
-    planners = DepthPlanners(model, args.run / CHECKPOINT_NAME, folder, args.gradient_steps, args.progress)
+    dataset = Record.read(args.run).dataset
+    planners = DepthPlanners(model, args.run / CHECKPOINT_NAME, folder, args.gradient_steps, args.progress, dataset)
     steps = args.sampling_steps or [planners.config.sampling_steps]
     tried = {"depth": args.depths, "temperature": args.temperatures, "sampling_steps": steps}
     tried |= {"choice_factor": args.choice_factors} if args.choice_factors else {}
@@ -166,7 +168,7 @@ def open_run(args: argparse.Namespace) -> tuple[LoadedRun, SAID]:
     run = load_run(args.run, device=args.device)
     if not isinstance(run.model, SAID):
         raise ValueError(f"{args.run} is a run of '{run.info['algo']}', which has no planner; give one of --algo said.")
-    if not (args.run / CHECKPOINT_NAME).is_file():
+    if not Record.read(args.run).dataset and not (args.run / CHECKPOINT_NAME).is_file():
         raise ValueError(
             f"{args.run} has no {CHECKPOINT_NAME}, whose replay the planners are trained on; give the folder that the "
             "training left, and finish the run if it was stopped: sb3-said train --resume RUN_DIR"
@@ -186,7 +188,7 @@ def report(args: argparse.Namespace, run: LoadedRun, study: Study, winner: Froze
         played = before["results"]
     else:
         how = (args.report_episodes, args.report_seed)
-        played = [evaluate(run, answer, *how, latency_calls=100).to_dict() for answer in ANSWERS]
+        played = [evaluate(run, answer, *how, latency_calls=100).to_dict() for answer in answers(run.model)]
     run.model.save(folder / "best.zip")
     trials = [trial_to_dict(trial) for trial in finished(study)]
     choice = f"the best of {len(trials)} trials, mean return {winner.value:.1f} over {args.episodes} episodes"

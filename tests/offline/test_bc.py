@@ -6,6 +6,7 @@ import torch as th
 from gymnasium import spaces
 from small_task import Drift, delayed
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_said import DelayedObservationWrapper
 from sb3_said.offline import BC, Dataset
@@ -57,6 +58,19 @@ def test_it_answers_with_the_action_of_the_hidden_present(learned):
     error = np.mean((actions - batch.actions.numpy()) ** 2)
     ignoring = np.mean((np.tanh(-0.8 * obs["observation"][:, :1]) - batch.actions.numpy()) ** 2)
     assert error < 0.1 * ignoring and error < 0.01
+
+
+def test_vec_normalize_learns_from_the_logs():
+    env = VecNormalize(DummyVecEnv([lambda: delayed(delay=DELAY)]), norm_obs_keys=["observation"], norm_reward=False)
+    model, data = make(env), demonstrations(20)
+    model.take_dataset(data)
+    rms = env.obs_rms["observation"]
+    np.testing.assert_allclose([rms.mean, rms.var], [data.states.mean(0), data.states.var(0)], atol=1e-4)
+    shown = model.replay_buffer.sample(600, env=env).observations["undelayed_observation"]
+    np.testing.assert_allclose(shown.std(0), 1.0, atol=0.15)
+    env.training = False  # a deployed one stays as it is
+    model.take_dataset(demonstrations(5, seed=3))
+    np.testing.assert_allclose(rms.mean, data.states.mean(0), atol=1e-4)
 
 
 def test_ages_are_those_of_play(learned):

@@ -221,7 +221,7 @@ def test_the_delay_range_and_its_flags_reach_the_run(tmp_path: Path) -> None:
     [(None, ""), (4, "-delay4"), ([0, 8], "-delay0-8"), ("UniformDelay(0, 8)", "-delayUniformDelay-0-8")],
 )
 def test_the_log_path_names_the_delay(delay: Delay, name: str) -> None:
-    assert manager.Run(delay, "smoke").delay_name == name
+    assert manager.Run(delay, "smoke").name == name
 
 
 def test_the_expert_can_learn_under_another_delay(tmp_path: Path) -> None:

@@ -1,0 +1,210 @@
+"""Why the present is inpainted: errors of a rolled-out one-step model and of inpainted states, over the delay.
+
+    python benchmarks/motivation.py --env Hopper-v5 --dataset medium.npz --json motivation.json --plot motivation.png
+    python benchmarks/motivation.py ... --actor logs/sadr/Hopper-v5-seed1_1    # who acts on the beliefs, in BC's place
+
+Three beliefs of the present learn from the same episodes, with as many gradient steps each: "inpainted" is SAID's
+planner, "rolled out" an MLP of one step that is rolled out over the actions since, "regressed" an MLP that is asked for
+the present at once. One network of each serves all delays.
+
+error   root mean squared error of s_t on held-out episodes, in standard deviations of the states, the same windows for
+        all beliefs
+return  of one actor without delay that acts on each belief, over seeded episodes: behaviour cloning of the same
+        episodes at delay 0, or --actor. Beside it "old observation", on which it acts as if nothing was delayed, and
+        "SAID", whose planner decides itself
+"""
+
+from __future__ import annotations
+
+import argparse
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from tqdm import tqdm
+
+from sb3_said import SAID, DelayedObservationWrapper
+from sb3_said.evaluation import Summary, plots, rollout
+from sb3_said.files.atomic import write_json
+from sb3_said.offline import BC, Dataset, load_dataset, normalized_score, reference_returns
+from sb3_said.offline.belief import (
+    Belief,
+    BeliefOnly,
+    LearnedBelief,
+    PlannerBelief,
+    RegressedPresent,
+    RolledOutModel,
+    belief_error,
+    train_belief,
+)
+
+N_WINDOWS = 5_000  # held out, at most
+
+
+class OldObservation:
+    """Takes the newest observation for the present, whatever its age."""
+
+    def __init__(self, max_delay: int):
+        self.max_delay = max_delay
+
+    def present(self, state: th.Tensor, action_history: th.Tensor, delay: th.Tensor) -> th.Tensor:
+        return state
+
+
+def split(data: Dataset, held_out: float, seed: int) -> tuple[Dataset, Dataset]:
+    """Return training and held-out episodes.
+
+    :raises ValueError: when there are not two episodes
+    """
+    n = len(data.lengths)
+    if n < 2:
+        raise ValueError(f"The data has {n} episode; two are needed, one of them to hold out.")
+    is_held = np.zeros(n, bool)
+    is_held[np.random.default_rng(seed).permutation(n)[: max(1, round(n * held_out))]] = True
+    return data.select(~is_held), data.select(is_held)
+
+
+def train(data: Dataset, args: argparse.Namespace) -> tuple[SAID, dict[str, Belief], Any]:
+    """Return SAID, the beliefs by name and the actor."""
+    task = gym.make(args.env)
+    env = DelayedObservationWrapper(gym.make(args.env), delay=(0, args.max_delay))
+    said = SAID("MlpPolicy", env, seed=args.seed, device=args.device, planner_kwargs=args.planner_kwargs)
+    # rows of the log go nowhere; a progress bar shows the updates
+    said.learn_offline(data, args.gradient_steps, folder=args.folder, progress_bar=True)
+    source = data.to_replay(task.observation_space, task.action_space).window_source()
+    sizes = source.obs_dim, source.act_dim, args.max_delay
+    networks: dict[str, LearnedBelief] = {}
+    for name, cls in (("rolled out", RolledOutModel), ("regressed", RegressedPresent)):
+        th.manual_seed(args.seed)
+        networks[name] = cls(*sizes).to(args.device)
+        train_belief(networks[name], source, args.gradient_steps, seed=args.seed, progress_bar=True)
+    if args.actor is not None:
+        from sb3_said.zoo.runs import load_run
+
+        actor: Any = load_run(args.actor, device=args.device).model
+    else:
+        actor = BC("MlpPolicy", task, seed=args.seed, device=args.device, buffer_size=10)
+        actor.learn_offline(data, args.gradient_steps, progress_bar=True)
+    beliefs = {"inpainted": PlannerBelief(said.policy.planner), **networks}
+    return said, beliefs | {"old observation": OldObservation(args.max_delay)}, actor
+
+
+def errors(held: Dataset, beliefs: dict[str, Belief], args: argparse.Namespace) -> dict[str, list[float]]:
+    """Return the error of each belief at each delay."""
+    task = gym.make(args.env)
+    source = held.to_replay(task.observation_space, task.action_space).window_source()
+    starts = th.randperm(len(source), generator=th.Generator().manual_seed(args.seed))[:N_WINDOWS]
+    windows = source.gather(starts, args.max_delay + 1).to(args.device)
+    return {name: [belief_error(belief, windows, d) for d in args.delays] for name, belief in beliefs.items()}
+
+
+def returns(players: dict[str, Any], args: argparse.Namespace) -> dict[str, list[Summary]]:
+    """Play the same episodes with each player under each delay."""
+    table: dict[str, list[Summary]] = {name: [] for name in players}
+    for name, player in tqdm(players.items(), unit="player"):
+        for delay in args.delays:
+
+            def make_env(delay: int = delay) -> gym.Env[Any, Any]:
+                return DelayedObservationWrapper(gym.make(args.env), delay, max_delay=args.max_delay)
+
+            played = rollout(player, make_env, args.episodes, args.eval_seed, args.n_envs)
+            table[name].append(Summary.from_episodes(name, played.returns, played.lengths))
+    return table
+
+
+def draw(path: Path, document: dict[str, Any], table: dict[str, list[Summary]]) -> None:
+    """Draw errors and returns over the delay, side by side."""
+    title = f"{document['env']}: {document['gradient_steps']:,} gradient steps each"
+    left, right = plots.panels(2, title, width=5.5)
+    rows = {**{name: None for name in document["errors"]}, **{name: None for name in table}}
+    color_of = dict(zip(rows, plots.colors(len(rows)), strict=True))
+    delays = document["delays"]
+    for name, row in document["errors"].items():
+        left.plot(delays, row, marker="o", markersize=4, color=color_of[name], label=name)
+    for name, summaries in table.items():
+        means = [s.mean_return for s in summaries]
+        right.plot(delays, [m.value for m in means], marker="o", markersize=4, color=color_of[name], label=name)
+        bounds = [[getattr(m, side) for m in means] for side in ("low", "high")]
+        right.fill_between(delays, *bounds, color=color_of[name], alpha=0.15, linewidth=0)
+    left.set_ylabel("error of the present (standard deviations)")
+    right.set_ylabel("return of an episode (undiscounted)")
+    for ax in (left, right):
+        ax.set_xlabel("delay (control steps)")
+        ax.legend(frameon=False, fontsize="small")
+    plots.save(left, path)
+
+
+def show(rows: dict[str, list[str]], what: str, delays: list[int]) -> None:
+    """Print a Markdown table over the delays."""
+    print(f"\n| {what} | " + " | ".join(map(str, delays)) + " |\n|---|" + "---:|" * len(delays))
+    for name, row in rows.items():
+        print(f"| {name} | " + " | ".join(row) + " |")
+
+
+def main(argv: list[str] | None = None) -> dict[str, Any]:
+    """Train, measure, print, write, and return the numbers."""
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("--env", default="Hopper-v5")
+    p.add_argument("--dataset", nargs="+", required=True, help="ids of Minari datasets, or files")
+    p.add_argument("--delays", type=int, nargs="+", default=[0, 1, 2, 4, 8, 12, 16])
+    p.add_argument("--gradient-steps", type=int, default=25_000, help="of each network")
+    p.add_argument("--actor", help="run folder or .zip of an agent of the task without delay (default: BC)")
+    p.add_argument("--held-out", type=float, default=0.05, help="part of the episodes that no network learns from")
+    p.add_argument("--episodes", type=int, default=50, help="of each return")
+    p.add_argument("--n-envs", type=int, default=10)
+    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--eval-seed", type=int, default=10_000, help="reset seed of the first episode")
+    p.add_argument("--planner-kwargs", type=partial(dict_of, "--planner-kwargs"), default={}, metavar="NAME=VALUE,...")
+    p.add_argument("--folder", type=Path, help="keep the planner's checkpoint there, and go on from it")
+    p.add_argument("--device", default="cpu")
+    p.add_argument("--num-threads", type=int, default=1)
+    p.add_argument("--json", type=Path)
+    p.add_argument("--plot", type=Path)
+    args = p.parse_args(argv)
+    args.max_delay = max(args.delays)
+    th.set_num_threads(args.num_threads)
+
+    task = gym.make(args.env)
+    data = load_dataset(args.dataset, task.observation_space, task.action_space, args.env)
+    training, held = split(data, args.held_out, args.seed)
+    said, beliefs, actor = train(training, args)
+    document: dict[str, Any] = {
+        name: getattr(args, name)
+        for name in ("env", "dataset", "delays", "gradient_steps", "episodes", "seed", "actor")
+    }
+    document |= {"training_steps": len(training), "held_out_steps": len(held), "held_out_episodes": len(held.lengths)}
+    document["planner"] = said.policy.planner.config.to_dict()
+    document["errors"] = errors(held, beliefs, args)
+    show({k: [f"{x:.3f}" for x in row] for k, row in document["errors"].items()}, "error at delay", args.delays)
+    players = {name: BeliefOnly(belief, actor, args.device) for name, belief in beliefs.items()} | {"SAID": said}
+    table = returns(players, args)
+    show({k: [str(s.mean_return) for s in row] for k, row in table.items()}, "return at delay", args.delays)
+    document["returns"] = {name: [summary.to_dict() for summary in row] for name, row in table.items()}
+    if reference_returns(args.env) is not None:
+        document["scores"] = {
+            name: [float(normalized_score(s.mean_return.value, args.env)) for s in row] for name, row in table.items()
+        }
+    if args.json is not None:
+        write_json(args.json, document)
+    if args.plot is not None:
+        draw(args.plot, document, table)
+    return document
+
+
+def dict_of(option: str, text: str) -> dict[str, Any]:
+    """Read ``name=number`` pairs, parted by commas.
+
+    :raises ArgumentTypeError: for anything else
+    """
+    try:
+        pairs = [pair.split("=") for pair in text.split(",")]
+        return {name: float(value) if "." in value else int(value) for name, value in pairs}
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{option} takes NAME=NUMBER,..., such as depth=2, got {text}") from error
+
+
+if __name__ == "__main__":
+    main()

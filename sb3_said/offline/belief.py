@@ -1,0 +1,262 @@
+"""Belief-only control: decode the present from what is known under delay, and let a policy without delay act on it."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from torch import nn
+from torch.nn import functional as F
+from tqdm.auto import tqdm
+
+from sb3_said.planner import InpaintingPlanner
+from sb3_said.planner.yardstick import RegressionYardstick
+from sb3_said.replay.windows import Windows, WindowSource
+
+Observation = dict[str, np.ndarray]
+
+
+class Belief(Protocol):
+    """Says in which state a task now is."""
+
+    max_delay: int
+
+    def present(self, state: th.Tensor, action_history: th.Tensor, delay: th.Tensor) -> th.Tensor:
+        """Return s_t: (B, obs_dim).
+
+        :param state: (B, obs_dim) s_{t-d}
+        :param action_history: (B, D, act_dim), the D newest actions in [-1, 1], oldest first
+        :param delay: (B,) int64 d, in 0..D
+        """
+
+
+class PlannerBelief:
+    """The present as an inpainting planner decodes it.
+
+    :param planner: of a trained SAID agent, ``model.policy.planner``
+    """
+
+    def __init__(self, planner: InpaintingPlanner):
+        self.planner, self.max_delay = planner, planner.max_delay
+
+    def present(self, state: th.Tensor, action_history: th.Tensor, delay: th.Tensor) -> th.Tensor:
+        """Return the one present that no initial noise leads to: (B, obs_dim)."""
+        return self.planner.plan(state, action_history, delay, n_candidates=1, temperature=0.0).present
+
+
+class LearnedBelief(nn.Module):
+    """A network that is trained on windows; states are z-scored by :meth:`fit_scale`.
+
+    :param max_delay: D, the largest delay
+    """
+
+    mean: th.Tensor
+    std: th.Tensor
+
+    def __init__(self, obs_dim: int, max_delay: int):
+        super().__init__()
+        self.max_delay = max_delay
+        self.register_buffer("mean", th.zeros(obs_dim))
+        self.register_buffer("std", th.ones(obs_dim))
+
+    def fit_scale(self, states: th.Tensor) -> None:
+        """Take over how states are spread.
+
+        :param states: (M, obs_dim)
+        """
+        std, mean = th.std_mean(states, dim=0)
+        self.mean.copy_(mean)
+        self.std.copy_(th.where(std > 1e-6, std, 1.0))
+
+    def loss(self, windows: Windows, generator: th.Generator) -> th.Tensor:
+        """Return the mean squared error of z-scored states.
+
+        :param windows: B windows of D + 1 steps
+        :param generator: of what is drawn beside them
+        """
+        raise NotImplementedError
+
+    def _z(self, states: th.Tensor) -> th.Tensor:
+        return (states - self.mean) / self.std
+
+
+class RolledOutModel(LearnedBelief):
+    """A model of one step, (s, a) to s', which is rolled out over the actions since: its errors compound.
+
+    :param hidden: width of the two hidden layers
+    """
+
+    def __init__(self, obs_dim: int, act_dim: int, max_delay: int, hidden: int = 512):
+        super().__init__(obs_dim, max_delay)
+        self.net = nn.Sequential(
+            *(nn.Linear(obs_dim + act_dim, hidden), nn.ReLU()),
+            *(nn.Linear(hidden, hidden), nn.ReLU()),
+            nn.Linear(hidden, obs_dim),
+        )
+        self.register_buffer("step_std", th.ones(obs_dim))
+
+    step_std: th.Tensor
+
+    def fit_scale(self, states: th.Tensor) -> None:
+        """Take over how states and their moves are spread, so that small moves count as much as large ones.
+
+        :param states: (M, obs_dim), in the order of time; the few moves between episodes are outliers
+        """
+        super().fit_scale(states)
+        moves = self._z(states).diff(dim=0).abs().median(0).values
+        self.step_std.copy_(th.where(moves > 1e-6, moves, 1.0))
+
+    def step(self, z: th.Tensor, action: th.Tensor) -> th.Tensor:
+        """Return the next z-scored states: (B, obs_dim).
+
+        :param z: (B, obs_dim), z-scored
+        :param action: (B, act_dim)
+        """
+        return z + self.step_std * self.net(th.cat([z, action], dim=1))
+
+    def present(self, state: th.Tensor, action_history: th.Tensor, delay: th.Tensor) -> th.Tensor:
+        """Take one step for each action sent since: (B, obs_dim)."""
+        z = self._z(state)
+        for k in range(self.max_delay):
+            is_since = (self.max_delay - k <= delay)[:, None]  # a_{t-D+k} came after s_{t-d}
+            z = th.where(is_since, self.step(z, action_history[:, k]), z)
+        return z * self.std + self.mean
+
+    def loss(self, windows: Windows, generator: th.Generator) -> th.Tensor:
+        """Return the error of one step, in units of moves; a window gives its first."""
+        z, follows = self._z(windows.states[:, :2]), windows.valid[:, 1]
+        error = (self.step(z[:, 0], windows.actions[:, 0]) - z[:, 1]) / self.step_std
+        return (error**2).mean(1)[follows].mean()
+
+
+class RegressedPresent(LearnedBelief):
+    """A plain regression from the old state and the actions since to the present.
+
+    :param hidden: width of the two hidden layers
+    """
+
+    def __init__(self, obs_dim: int, act_dim: int, max_delay: int, hidden: int = 512):
+        super().__init__(obs_dim, max_delay)
+        self.net = RegressionYardstick(obs_dim, act_dim, max_delay, hidden)
+
+    def present(self, state: th.Tensor, action_history: th.Tensor, delay: th.Tensor) -> th.Tensor:
+        """Ask the network once: (B, obs_dim)."""
+        order = th.arange(self.max_delay, device=delay.device) + self.max_delay - delay[:, None]  # (B, D)
+        rows = order.clamp(max=self.max_delay - 1)[..., None].expand(-1, -1, action_history.shape[2])
+        since = action_history.gather(1, rows)  # a_{t-d} first, as in a window; the network looks away from the rest
+        return self.net(self._z(state), since, delay)[0] * self.std + self.mean
+
+    def loss(self, windows: Windows, generator: th.Generator) -> th.Tensor:
+        """Return the error at random ages."""
+        delay = th.randint(self.max_delay + 1, (len(windows.states),), generator=generator).to(windows.states.device)
+        rows = th.arange(len(delay), device=delay.device)
+        present, _ = self.net(self._z(windows.states[:, 0]), windows.actions, delay)
+        error = F.mse_loss(present, self._z(windows.states[rows, delay]), reduction="none").mean(1)  # (B,)
+        return error[windows.valid[rows, delay]].mean()
+
+
+def train_belief(
+    belief: LearnedBelief,
+    source: WindowSource,
+    gradient_steps: int,
+    batch_size: int = 256,
+    learning_rate: float = 1e-3,
+    seed: int = 0,
+    progress_bar: bool = False,
+) -> None:
+    """Train a belief with Adam, whose rate falls to 0 by a cosine.
+
+    :param belief: to train, on its own device
+    :param source: windows of true states, such as ``model.replay_buffer.window_source()``
+    :param seed: of the batches
+    :param progress_bar: show one
+    """
+    device, generator = belief.mean.device, th.Generator().manual_seed(seed)
+    belief.fit_scale(source.start_states().to(device))
+    optimizer = th.optim.Adam(belief.parameters(), learning_rate)
+    scheduler = th.optim.lr_scheduler.CosineAnnealingLR(optimizer, gradient_steps)
+    for _ in tqdm(range(gradient_steps), desc=type(belief).__name__, disable=not progress_bar):
+        windows = source.sample(batch_size, belief.max_delay + 1, generator).to(device)
+        loss = belief.loss(windows, generator)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        scheduler.step()
+
+
+@th.no_grad()
+def belief_error(belief: Belief, windows: Windows, delay: int) -> float:
+    """Return the root of the mean squared error of s_t, in standard deviations of the windows' states.
+
+    :param windows: held out from training, of at least delay + 1 steps
+    :param delay: d, the same for all
+    :raises ValueError: when no episode is so long
+    """
+    reach = windows.valid[:, delay]
+    if not reach.any():
+        raise ValueError(f"No window has {delay + 1} steps of one episode, which an error at delay {delay} needs.")
+    states, actions = windows.states[reach], windows.actions[reach]
+    history = F.pad(actions[:, :delay], (0, 0, belief.max_delay - delay, 0))  # (B, D, act_dim)
+    found = belief.present(states[:, 0], history, th.full((len(states),), delay, device=states.device))
+    spread = windows.states[windows.valid].std(0).clamp(min=1e-6)
+    return float((((found - states[:, delay]) / spread) ** 2).mean().sqrt())
+
+
+class BeliefOnly:
+    """A policy without delay that acts on a belief of the present; it has SB3's ``predict``.
+
+    :param belief: says where the task is
+    :param actor: anything with SB3's ``predict`` and ``observation_space``: an agent of a task without delay, or one of
+        ours under delay, which is shown the believed state at age 0
+    :param device: of the belief
+    :raises ValueError: for an actor of other observations
+    """
+
+    def __init__(self, belief: Belief, actor: Any, device: th.device | str = "cpu"):
+        space = actor.observation_space
+        is_dict = isinstance(space, spaces.Dict)
+        if not (isinstance(space, spaces.Box) or (is_dict and "action_history" in space.spaces)):
+            raise ValueError(f"The actor reads {space}; expected states, or those of a DelayedObservationWrapper.")
+        self.belief, self.actor, self.device = belief, actor, th.device(device)
+        self.history_shape = space["action_history"].shape if is_dict else None
+
+    @th.no_grad()
+    def present(self, observation: Observation) -> np.ndarray:
+        """Return what the belief makes of batched observations: (B, obs_dim).
+
+        :raises ValueError: for an action history of another length than the belief's largest delay
+        """
+        given = np.asarray(observation["action_history"], np.float32)
+        if given.shape[1] != self.belief.max_delay:
+            raise ValueError(
+                f"The belief serves delays up to {self.belief.max_delay}, but the action history has {given.shape[1]} "
+                f"rows; give the task DelayedObservationWrapper(..., max_delay={self.belief.max_delay})."
+            )
+        state, history = (
+            th.as_tensor(np.array(x, np.float32), device=self.device) for x in (observation["observation"], given)
+        )
+        delay = th.as_tensor(np.array(observation["delay"][:, 0], np.int64), device=self.device)
+        return self.belief.present(state, history, delay).cpu().numpy()
+
+    def predict(
+        self,
+        observation: Observation,
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Answer one delayed observation or a batch of them as the actor answers the believed present."""
+        is_batch = np.ndim(observation["delay"]) == 2
+        batch = observation if is_batch else {key: np.asarray(value)[None] for key, value in observation.items()}
+        present: Any = self.present(batch)
+        if self.history_shape is not None:
+            n = len(present)
+            present = {
+                "observation": present,
+                "action_history": np.zeros((n, *self.history_shape), np.float32),
+                "delay": np.zeros((n, 1), np.float32),
+            }
+        action, state = self.actor.predict(present, state, episode_start, deterministic)
+        return (action if is_batch else action[0]), state

@@ -1,0 +1,108 @@
+"""Datasets into files that others read, too: an ``.npz`` with D4RL's columns, or a Minari dataset."""
+
+from __future__ import annotations
+
+import copy
+import os
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from sb3_said.delays.space import check_spaces, unscale_action
+from sb3_said.files.atomic import replacing
+from sb3_said.offline.datasets import Dataset, is_file
+from sb3_said.offline.scores import reference_returns
+
+
+def check_target(target: str | os.PathLike[str]) -> None:
+    """Refuse a place where a dataset cannot be written, before it is made.
+
+    :param target: path of an ``.npz``, or id of a Minari dataset such as ``"hopper/mine-v0"``
+    :raises ValueError: for a file of another format, and for one that is there already
+    :raises ImportError: without Minari
+    """
+    if is_file(target):
+        if Path(target).suffix != ".npz":
+            raise ValueError(f"Datasets are written as .npz or into Minari, got {os.fspath(target)}.")
+        if Path(target).exists():
+            raise ValueError(f"{os.fspath(target)} is there already; give another name, or remove it.")
+        return
+    name = os.fspath(target)
+    if not name.rpartition("-v")[2].isdigit():
+        raise ValueError(f"{name!r} is neither an .npz nor an id of Minari, which ends in its version: {name}-v0.")
+    if name in _minari().list_local_datasets():
+        raise ValueError(f"Minari has a dataset {name} already; give another name or version.")
+
+
+def write_dataset(
+    data: Dataset, target: str | os.PathLike[str], env: gym.Env[Any, Any], about: str = "", algorithm: str = ""
+) -> None:
+    """Write a dataset; :func:`~sb3_said.offline.load_dataset` reads it again.
+
+    :param data: to write
+    :param target: path of an ``.npz``, or id of a Minari dataset such as ``"hopper/mine-v0"``
+    :param env: the task it is of, with or without ``DelayedObservationWrapper``
+    :param about: kept in the file, for its readers
+    :param algorithm: whose data it is, for Minari
+    :raises ValueError: as :func:`check_target`
+    """
+    check_target(target)
+    state_space, _ = check_spaces(env.observation_space, env.action_space)
+    assert isinstance(env.action_space, gym.spaces.Box)  # as check_spaces says
+    actions = unscale_action(data.actions, env.action_space)
+    if is_file(target):
+        columns = {
+            "observations": data.states,
+            "actions": actions,
+            "rewards": data.rewards,
+            "terminals": data.terminated,
+            "timeouts": data.ends & ~data.terminated,
+            "next_observations": data.next_states,
+            "about": np.array(about),
+        }
+        with replacing(target) as file:
+            np.savez(file, **columns)
+        return
+    from minari.data_collector import EpisodeBuffer
+
+    stops = np.flatnonzero(data.ends) + 1
+    spec = env.unwrapped.spec
+    if spec is not None:  # what was registered, with the arguments that were given; its own lacks the time limit
+        spec, kwargs = copy.deepcopy(gym.spec(spec.id)), spec.kwargs
+        spec.kwargs = {**spec.kwargs, **kwargs}
+    reference = reference_returns(spec.id) if spec is not None else None
+    scores = {} if reference is None else {"ref_min_score": reference[0], "ref_max_score": reference[1]}
+    buffers = []
+    for i, (stop, length) in enumerate(zip(stops, data.lengths, strict=True)):
+        steps = slice(stop - length, stop)
+        buffers.append(
+            EpisodeBuffer(
+                id=i,
+                observations=np.concatenate([data.states[steps], data.finals[[i]]]),
+                actions=actions[steps],
+                rewards=data.rewards[steps],
+                terminations=data.terminated[steps],
+                truncations=(data.ends & ~data.terminated)[steps],
+                infos={},
+            )
+        )
+    _minari().create_dataset_from_buffers(
+        os.fspath(target),
+        buffers,
+        env=spec,
+        algorithm_name=algorithm,
+        description=about,
+        observation_space=state_space,
+        action_space=env.action_space,
+        **scores,
+    )
+
+
+def _minari() -> Any:
+    try:
+        import minari
+    except ImportError as error:
+        raise ImportError('Minari is missing: pip install "sb3_said[offline]", or write an .npz.') from error
+    return minari

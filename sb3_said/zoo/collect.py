@@ -1,0 +1,267 @@
+"""Let trained agents play, and log the true states as a dataset to learn from."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+import stable_baselines3
+import torch as th
+from tqdm import tqdm
+
+from sb3_said.delays.space import EXECUTED, UNDELAYED, check_spaces, scale_action
+from sb3_said.offline.datasets import Dataset
+from sb3_said.offline.scores import normalized_score, reference_returns
+from sb3_said.offline.writing import check_target, write_dataset
+from sb3_said.zoo.arguments import add_delay, add_playing, check_positive, explained, make_parser, read_delay
+from sb3_said.zoo.manager import ALGOS
+from sb3_said.zoo.runs import LoadedRun, load_run, origin
+
+EPILOG = """\
+examples:
+  # 300,000 steps of a trained agent, a third of them at each noise level, into an .npz
+  sb3-said collect logs/sadr/Hopper-v5-seed1_1 --noise 0 0.1 0.3 --steps 300000 -o hopper_medium.npz
+
+  # half an agent's, half random actions, into a Minari dataset; an agent named twice has twice the share
+  sb3-said collect logs/sadr/Hopper-v5-seed1_1 random -o hopper/mixed-v0
+
+  # an agent of Stable-Baselines3; opening its file runs what is pickled in it
+  sb3-said collect ppo_hopper.zip --algo ppo --env Hopper-v5 -o hopper_ppo.npz
+
+  # an agent of ours that acts under delay: the log has the true states all the same
+  sb3-said collect logs/said/Hopper-v5-delay4-seed1_1 --delay 2 -o hopper_d2.npz
+
+  sb3-said train --algo said --env Hopper-v5 --delay 8 --dataset hopper_medium.npz
+
+Each agent has an equal share of the steps at each noise level; the last episode of a share is cut off where it is full.
+Noise is Gaussian, in units of half the range between an action's bounds. Episode i of an agent at a noise level starts
+from reset seed --seed + i, by default where neither training nor evaluation nor tuning begins.
+"""
+
+
+@dataclass
+class Episode:
+    """What one episode was, as the task itself saw it."""
+
+    states: list[np.ndarray]
+    """s_0 and the state after each step"""
+    actions: list[np.ndarray] = field(default_factory=list)
+    """as they were executed, scaled to [-1, 1]"""
+    rewards: list[float] = field(default_factory=list)
+    terminated: bool = False
+
+    def cut(self, n_steps: int) -> Episode:
+        """Return the first steps of it."""
+        ended = self.terminated and n_steps >= len(self.rewards)
+        return Episode(self.states[: n_steps + 1], self.actions[:n_steps], self.rewards[:n_steps], ended)
+
+
+class Recorder(gym.Wrapper[Any, Any, Any, Any]):
+    """Adds each episode that ends to a list, with the true states of a delayed task."""
+
+    def __init__(self, env: gym.Env[Any, Any], episodes: list[Episode]):
+        super().__init__(env)
+        self.episodes = episodes
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        observation, info = self.env.reset(**kwargs)
+        self.episode = Episode([true_state(observation, info)])
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        is_delayed = isinstance(observation, dict)
+        assert isinstance(self.action_space, gym.spaces.Box)  # as check_spaces says
+        executed = info[EXECUTED] if is_delayed and EXECUTED in info else scale_action(action, self.action_space)
+        self.episode.states.append(true_state(observation, info))
+        self.episode.actions.append(np.asarray(executed, np.float32))
+        self.episode.rewards.append(float(reward))
+        if terminated or truncated:
+            self.episode.terminated = terminated
+            self.episodes.append(self.episode)
+        return observation, reward, terminated, truncated, info
+
+
+def true_state(observation: Any, info: dict[str, Any]) -> np.ndarray:
+    """Return the state that a task is in, whatever a delay shows of it."""
+    return np.array(info[UNDELAYED] if isinstance(observation, dict) else observation, np.float32)
+
+
+class NoisyAgent:
+    """An agent's actions with Gaussian noise, clipped to the bounds; or random ones.
+
+    :param model: anything with SB3's ``predict``; None for actions uniform between the bounds
+    :param space: of the actions
+    :param noise: standard deviation, in units of half the range between the bounds
+    :param seed: of noise and random actions
+    """
+
+    def __init__(self, model: Any, space: gym.spaces.Box, noise: float, seed: int):
+        self.model, self.space, self.noise = model, space, noise
+        self.policy = getattr(model, "policy", None)  # by which a recurrent agent is known
+        self.rng = np.random.default_rng(seed)
+
+    def predict(self, observation: Any, state: Any = None, **how: Any) -> tuple[np.ndarray, Any]:
+        low, high = self.space.low, self.space.high
+        if self.model is None:
+            n = len(next(iter(observation.values())) if isinstance(observation, dict) else observation)
+            return self.rng.uniform(low, high, (n, *low.shape)).astype(low.dtype), None
+        action, state = self.model.predict(observation, state=state, **how)
+        drawn = self.rng.normal(size=action.shape) * self.noise * (high - low) / 2
+        return np.clip(action + drawn, low, high).astype(low.dtype), state
+
+
+@dataclass(frozen=True)
+class Share:
+    """Who plays a part of the steps, and how."""
+
+    name: str
+    run: LoadedRun
+    """whose model may be None, for random actions"""
+    noise: float
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = make_parser(__doc__, EPILOG)
+    parser.add_argument("agents", nargs="+", metavar="AGENT", help="run folder, an agent's .zip, or the word random")
+    parser.add_argument("-o", "--output", required=True, metavar="NPZ_OR_ID", help="file to write, ending in .npz, "
+                        "or id of a Minari dataset, ending in -v0")  # fmt: skip
+    parser.add_argument("--steps", type=int, default=300_000, help="steps of the dataset (default: 300000)")
+    parser.add_argument(
+        "--noise", type=float, nargs="+", default=[0.0], metavar="STD", help="noise levels (default: 0)"
+    )
+    parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the best")
+    parser.add_argument("--n-envs", type=int, default=8, help="episodes played side by side (default: 8)")
+    add_delay(parser, default="the trained one")
+    add_playing(parser, episodes=None, seed=30_000)
+    args = parser.parse_args(argv)
+    with explained(parser):
+        check_positive(args, "steps", "n_envs", "num_threads")
+        if min(args.noise) < 0:
+            raise ValueError(f"--noise is a standard deviation, 0 or more, got {min(args.noise)}.")
+        check_target(args.output)
+        th.set_num_threads(args.num_threads)
+        shares = list(open_agents(args))
+        if args.steps < len(shares):
+            raise ValueError(f"--steps is {args.steps}, fewer than there are shares, {len(shares)}.")
+        parts = []
+        with tqdm(total=args.steps, unit="step") as bar:
+            for i, share in enumerate(shares):
+                n_steps = args.steps * (i + 1) // len(shares) - args.steps * i // len(shares)
+                parts.append(play(share, n_steps, args.seed, args.n_envs, not args.stochastic, bar))
+        run = shares[0].run
+        told = [describe(share, part, run.info["env"]) for share, part in zip(shares, parts, strict=True)]
+        about = json.dumps({**origin(run), "seed": args.seed, "shares": told})
+        data = join([episode for part in parts for episode in part])
+        env = run.make_env()
+        write_dataset(data, args.output, env, about, ", ".join(dict.fromkeys(share.name for share in shares)))
+        env.close()
+    print(f"Wrote {args.output}: {len(data):,} steps, {len(data.lengths):,} episodes")
+
+
+def open_agents(args: argparse.Namespace) -> Iterator[Share]:
+    """Open each agent, at each noise level.
+
+    :raises ValueError: for what cannot be opened, agents of several tasks, or random actions alone of no task
+    """
+    names = dict.fromkeys(args.agents)
+    runs = {name: open_agent(name, args) for name in names if name != "random"}
+    tasks = {run.info["env"]: run for run in runs.values()}
+    if len(tasks) > 1:
+        raise ValueError(f"A dataset is of one task, but the agents are of {', '.join(tasks)}.")
+    if "random" in names:
+        if not tasks and args.env is None:
+            raise ValueError("Random actions are of no task: give --env.")
+        make_env = next(iter(runs.values())).make_env if runs else lambda: gym.make(args.env)
+        info = {"env": args.env or next(iter(tasks)), "algo": "random"}
+        runs["random"] = LoadedRun(None, make_env, None, Path(), info)  # type: ignore[arg-type]
+    for name in args.agents:
+        for noise in args.noise if name != "random" else [0.0] * len(args.noise):
+            yield Share(name, runs[name], noise)
+
+
+def open_agent(name: str, args: argparse.Namespace) -> LoadedRun:
+    """Open a run or agent of this package, or a file that an algorithm of Stable-Baselines3 saved.
+
+    :raises ValueError: when the files do not say what to load
+    """
+    path = Path(name)
+    if not (path.is_file() and zipfile.is_zipfile(path) and "policy.pth" in zipfile.ZipFile(path).namelist()):
+        played = args.algo, args.env, read_delay(args.delay), args.device
+        return load_run(path, *played, gym_packages=args.gym_packages)
+    if args.env is None or args.algo not in ALGOS:
+        raise ValueError(f"{path} is of Stable-Baselines3: name its task with --env and its class with --algo.")
+    if args.delay:
+        raise ValueError(f"{path} is of Stable-Baselines3, whose agents know no delay: leave out --delay.")
+    cls: Any = getattr(stable_baselines3, args.algo.upper(), ALGOS[args.algo])  # "sac" is ours in ALGOS
+    model = cls.load(path, device=args.device)
+    return LoadedRun(model, lambda: gym.make(args.env), None, path.parent, {"env": args.env, "algo": args.algo})
+
+
+def play(share: Share, n_steps: int, seed: int, n_envs: int, deterministic: bool, bar: tqdm[Any]) -> list[Episode]:
+    """Play episodes until there are so many steps; the last one is cut off.
+
+    :param bar: moves on with the steps
+    """
+    episodes: list[Episode] = []
+    kept: list[Episode] = []
+    used, left = 0, n_steps
+
+    def make_env() -> gym.Env[Any, Any]:
+        return Recorder(share.run.make_env(), episodes)
+
+    env = share.run.make_env()
+    check_spaces(env.observation_space, env.action_space)
+    agent = NoisyAgent(share.run.model, env.action_space, share.noise, seed)  # type: ignore[arg-type]  # it is a Box
+    env.close()
+    player = replace(share.run, model=agent, make_env=make_env)  # type: ignore[arg-type]  # it has predict
+    while left > 0:
+        lengths = [len(episode.rewards) for episode in kept]
+        n_episodes = max(n_envs, math.ceil(left / np.mean(lengths))) if lengths else n_envs
+        player.play(n_episodes, seed + used, n_envs, deterministic=deterministic)
+        used += n_episodes
+        for episode in episodes:
+            if left > 0:
+                kept.append(episode.cut(left))
+                left -= len(kept[-1].rewards)
+                bar.update(len(kept[-1].rewards))
+        episodes.clear()
+    return kept
+
+
+def join(episodes: list[Episode]) -> Dataset:
+    """Lay episodes end to end."""
+    ends = [np.arange(1, len(e.rewards) + 1) == len(e.rewards) for e in episodes]
+    return Dataset(
+        states=np.concatenate([e.states[:-1] for e in episodes]),
+        actions=np.concatenate([e.actions for e in episodes]),
+        rewards=np.concatenate([np.array(e.rewards, np.float32) for e in episodes]),
+        terminated=np.concatenate([end & e.terminated for end, e in zip(ends, episodes, strict=True)]),
+        ends=np.concatenate(ends),
+        finals=np.stack([e.states[-1] for e in episodes]),
+    )
+
+
+def describe(share: Share, episodes: list[Episode], env_id: str) -> dict[str, Any]:
+    """Print what a share earned, and return it in JSON types."""
+    returns = [sum(episode.rewards) for episode in episodes]
+    mean = float(np.mean(returns))
+    told = {"agent": share.name, "noise": share.noise, "episodes": len(episodes), "mean_return": mean}
+    score = ""
+    if reference_returns(env_id) is not None:
+        told["normalized_score"] = float(normalized_score(mean, env_id))
+        score = f", normalised score {told['normalized_score']:.1f}"
+    print(
+        f"{share.name}, noise {share.noise:g}: {len(episodes)} episodes, mean return {mean:,.1f}{score}",
+        file=sys.stderr,
+    )
+    return told

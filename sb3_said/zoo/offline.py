@@ -1,0 +1,81 @@
+"""Runs that learn from logs: their environment is made for its spaces and its delay, and no step of it is taken."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_said.files.checkpoint import TrainingCheckpointCallback
+from sb3_said.offline import OfflineAlgorithm
+from sb3_said.said import SAID
+from sb3_said.zoo.manager import DelayedExperimentManager, Run
+
+SAVE_INTERVAL = 1_000  # updates of a planner between two checkpoints
+
+
+class OfflineExperimentManager(DelayedExperimentManager):
+    """The manager for ``--dataset``. Steps are gradient steps, those of the planner in SAID.
+
+    :param run: what our command line adds
+    :param args: rl_zoo3's parsed arguments, then its own parameters
+    :raises ValueError: for a run that another process trains or that cannot go on, and for an option without effect
+    """
+
+    LOG_INTERVAL = 500  # gradient steps
+
+    def __init__(self, run: Run, args: argparse.Namespace, algo: str, env_id: str, *zoo_args: Any, **zoo_kwargs: Any):
+        super().__init__(run, args, algo, env_id, *zoo_args, **zoo_kwargs)
+        given = {"-params planner_gradient_steps": "planner_gradient_steps" in (self.custom_hyperparams or {})}
+        given |= {"--save-replay-buffer": self.save_replay_buffer}
+        if unused := [name for name, is_given in given.items() if is_given]:
+            self.release()
+            raise ValueError(
+                f"{', '.join(unused)} has no place in a training from logs, whose steps -n sets and whose replay the "
+                "dataset is: leave it out."
+            )
+
+    def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
+        """Make the agent as rl_zoo3 does, and read the dataset; a dataset that does not fit ends the program."""
+        made = super().setup_experiment()
+        assert made is not None and isinstance(made[0], OfflineAlgorithm)  # no -optimize, as the constructor saw to
+        model = made[0]
+        try:
+            model.take_dataset([*self.run.dataset], self.show_progress)
+        except (ValueError, ImportError) as error:
+            sys.exit(f"sb3-said train: error: {error}")
+        replay = model.replay_buffer
+        print(f"Learning from {replay.size():,} logged steps; no environment is stepped but in evaluations.")
+        return made
+
+    def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
+        made = super()._preprocess_hyperparams(hyperparams)
+        if self.algo == "said":
+            made[0]["planner_gradient_steps"] = self.n_timesteps
+        return made
+
+    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
+        """Make environments without a file of their episodes."""
+        return super().create_envs(n_envs, eval_env, no_log=True)
+
+    def _set_evaluation(self) -> None:
+        pass  # there is no expert: it is the agent that is evaluated
+
+    def _add_checkpoints(self) -> None:
+        freq, stopping = self.run.checkpoint_freq, self.stopping
+        self.checkpointing = TrainingCheckpointCallback(self.folder, freq, stopping, keeps_replay=False)
+        if self.algo != "said":  # whose planner keeps its own
+            self.callbacks.append(self.checkpointing)
+
+    def _learn(self, model: Any, steps: int, **how: Any) -> None:
+        if isinstance(model, SAID):
+            save_interval = self.run.checkpoint_freq or SAVE_INTERVAL
+            how |= {"folder": self.folder, "should_stop": self.stopping, "save_interval": save_interval}
+            how["log_interval"] = how["log_interval"] or steps  # one row, at the end
+        model.learn_offline(None, steps, **how)
+
+    def _save_checkpoint(self) -> bool:
+        return self.algo == "said" or super()._save_checkpoint()  # a planner's is written when it is asked to stop

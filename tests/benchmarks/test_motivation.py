@@ -1,0 +1,63 @@
+"""The motivation experiment, tiny: what it writes is what it measured, and held-out episodes teach nobody."""
+
+import json
+
+import gymnasium as gym
+import motivation
+import numpy as np
+import pytest
+
+from sb3_said.offline import Dataset, write_dataset
+
+ENV = "InvertedPendulum-v5"
+
+
+@pytest.fixture(scope="module")
+def log():
+    """Episodes of random actions, of different lengths."""
+    env, rng = gym.make(ENV), np.random.default_rng(0)
+    states, actions, ends, finals = [], [], [], []
+    for seed in range(12):
+        state, ended = env.reset(seed=seed)[0], False
+        while not ended:
+            states.append(state)
+            actions.append(rng.uniform(-1, 1, 1))
+            state, _, ended, _, _ = env.step(3 * actions[-1])
+            ends.append(ended)
+        finals.append(state)
+    floats = [np.array(x, np.float32) for x in (states, actions, np.ones(len(ends)))]
+    return Dataset(*floats, np.array(ends), np.array(ends), np.array(finals, np.float32))
+
+
+def test_selected_and_held_out_trajectories_are_whole(log):
+    training, held = motivation.split(log, 0.25, seed=1)
+    assert len(held.lengths) == 3 and sorted([*training.lengths, *held.lengths]) == sorted(log.lengths)
+    pieces = [motivation.split(log, 0.25, seed=1)[1], held]
+    np.testing.assert_array_equal(*(piece.states for piece in pieces))
+    for part in (training, held):
+        assert part.ends.sum() == len(part.finals) and part.ends[-1]
+        i = int(np.flatnonzero((log.finals == part.finals[0]).all(1))[0])
+        start = log.lengths[:i].sum()
+        np.testing.assert_array_equal(part.states[: part.lengths[0]], log.states[start : start + log.lengths[i]])
+    with pytest.raises(ValueError, match="two are needed"):
+        motivation.split(log.select(np.arange(12) == 3), 0.1, seed=0)
+
+
+def test_it_measures_errors_and_returns_of_each_belief(log, tmp_path, capsys):
+    pytest.importorskip("matplotlib")
+    write_dataset(log, tmp_path / "log.npz", gym.make(ENV))
+    paths = ["--json", str(tmp_path / "m.json"), "--plot", str(tmp_path / "m.png"), "--folder", str(tmp_path)]
+    tiny = (
+        "--gradient-steps 3 --episodes 2 --delays 0 2 --held-out 0.3 --planner-kwargs depth=1,d_model=32,batch_size=8"
+    )
+    made = motivation.main(["--env", ENV, "--dataset", str(tmp_path / "log.npz"), *tiny.split(), *paths])
+    written = json.loads((tmp_path / "m.json").read_text())
+    assert written["errors"] == made["errors"] and written["planner"]["d_model"] == 32
+    names = ["inpainted", "rolled out", "regressed", "old observation"]
+    assert list(written["errors"]) == names and list(written["returns"]) == [*names, "SAID"]
+    for name, (now, later) in written["errors"].items():
+        assert later > 0 and (now < 1e-6 or name == "regressed")  # which is asked at delay 0, too
+    at_0 = {name: row[0]["returns"] for name, row in written["returns"].items() if name not in ("regressed", "SAID")}
+    assert len({tuple(row) for row in at_0.values()}) == 1
+    assert (tmp_path / "m.png").read_bytes()[:4] == b"\x89PNG"
+    assert "| error at delay | 0 | 2 |" in capsys.readouterr().out

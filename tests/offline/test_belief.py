@@ -1,0 +1,152 @@
+"""Beliefs of the present: right where they can be, compounding where they are rolled out, and acted on."""
+
+import numpy as np
+import pytest
+import torch as th
+from small_planner import make_batch, make_planner
+from small_task import Drift, delayed
+from test_bc import demonstrations
+from test_bc import make as make_bc
+
+from sb3_said import DelayedSAC
+from sb3_said.evaluation import rollout
+from sb3_said.offline.belief import (
+    BeliefOnly,
+    PlannerBelief,
+    RegressedPresent,
+    RolledOutModel,
+    belief_error,
+    train_belief,
+)
+
+DELAY = 3
+
+
+class Truth:
+    """Knows the task of the demonstrations: s' = 0.9 s + 0.3 a."""
+
+    max_delay = DELAY
+
+    def present(self, state, action_history, delay):
+        for k in range(DELAY):
+            is_since = (DELAY - k <= delay)[:, None]
+            state = th.where(is_since, 0.9 * state + 0.3 * action_history[:, k], state)
+        return state
+
+
+@pytest.fixture(scope="module")
+def source():
+    replay = make_bc()
+    replay.take_dataset(demonstrations(60))
+    return replay.replay_buffer.window_source()
+
+
+@pytest.fixture(scope="module", params=[RolledOutModel, RegressedPresent])
+def learned(request, source):
+    th.manual_seed(0)
+    belief = request.param(2, 1, DELAY, hidden=64)
+    train_belief(belief, source, 300, learning_rate=5e-3)
+    return belief
+
+
+def held_out():
+    replay = make_bc()
+    replay.take_dataset(demonstrations(20, seed=1))
+    return replay.replay_buffer.window_source().gather(th.arange(500), DELAY + 1)
+
+
+def test_a_learned_belief_knows_a_deterministic_task(learned):
+    errors = [belief_error(learned, held_out(), delay) for delay in range(DELAY + 1)]
+    stale = [belief_error(Stale(), held_out(), delay) for delay in range(DELAY + 1)]
+    assert max(errors) < 0.15 and all(e < 0.25 * s for e, s in zip(errors[1:], stale[1:], strict=True))
+    if isinstance(learned, RolledOutModel):
+        assert errors[0] == pytest.approx(0, abs=1e-6) and errors == sorted(errors)  # they compound
+
+
+class Stale(Truth):
+    def present(self, state, action_history, delay):
+        return state
+
+
+def test_the_truth_has_no_error_and_each_row_its_own_delay(learned):
+    windows = held_out()
+    assert max(belief_error(Truth(), windows, delay) for delay in range(DELAY + 1)) < 1e-6
+    history, delay = th.rand(4, DELAY, 1), th.tensor([0, 1, 2, 3])
+    state = th.randn(4, 2)
+    with th.no_grad():
+        together = learned.present(state, history, delay)
+        alone = [learned.present(state[i : i + 1], history[i : i + 1], delay[i : i + 1]) for i in range(4)]
+        th.testing.assert_close(together, th.cat(alone))
+        other = history.clone()
+        other[1, : DELAY - 1] = 9.0  # sent before the observation of age 1: it holds all that they did
+        th.testing.assert_close(learned.present(state, other, delay), together)
+
+
+def test_a_planners_belief_repeats_and_keeps_what_is_known():
+    planner = make_planner(DELAY)
+    state, history, delay = make_batch(6, DELAY)
+    delay[0] = 0
+    belief = PlannerBelief(planner)
+    present = belief.present(state, history, delay)
+    th.testing.assert_close(belief.present(state, history, delay), present, rtol=0, atol=0)
+    th.testing.assert_close(present[0], state[0])  # nothing is hidden at age 0
+    plan = planner.plan(state, history, delay, n_candidates=1, temperature=0.0)
+    th.testing.assert_close(present, plan.states[th.arange(6), 0, delay])
+
+
+def test_no_window_reaches_a_delay_that_no_episode_does():
+    windows = held_out()
+    with pytest.raises(ValueError, match="No window has 4 steps of one episode"):
+        belief_error(Truth(), windows._replace(valid=windows.valid & (th.arange(4) < 3)), DELAY)
+
+
+class Sees:
+    """An actor without delay that keeps what it was shown, and answers a = -s / 2."""
+
+    observation_space = Drift.observation_space
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        self.seen = observation
+        return -0.5 * observation[:, :1], state
+
+
+def test_an_actor_is_shown_the_present(source):
+    """On the true belief, it acts under delay as it does without."""
+
+    class Drifting(Truth):
+        def present(self, state, action_history, delay):
+            for k in range(DELAY):
+                is_since = (DELAY - k <= delay)[:, None]
+                moved = 0.9 * state + 0.1 * th.cat([2 * action_history[:, k], state[:, :1]], 1)
+                state = th.where(is_since, moved, state)
+            return state
+
+    env, plain, agent = delayed(DELAY), Drift(), BeliefOnly(Drifting(), Sees())
+    obs, state = env.reset(seed=3)[0], plain.reset(seed=3)[0]
+    for _ in range(8):
+        action, _ = agent.predict(obs)
+        np.testing.assert_allclose(action, -0.5 * state[:1], atol=1e-5)
+        obs, state = env.step(action)[0], plain.step(action)[0]
+    batch = {key: np.stack([value] * 2) for key, value in obs.items()}
+    assert agent.predict(batch)[0].shape == (2, 1)
+    played = rollout(agent, lambda: delayed(DELAY), 3, seed=0, n_envs=2)
+    assert len(played.returns) == 3
+
+
+def test_an_actor_of_ours_is_asked_at_age_0(recwarn):
+    actor = DelayedSAC("MlpPolicy", delayed((0, 2)), buffer_size=100, device="cpu", policy_kwargs={"net_arch": [8]})
+    actor.trained_ages = [0]
+    obs = delayed(DELAY).reset(seed=0)[0] | {"delay": np.array([2.0]), "action_history": np.full((DELAY, 1), 0.5)}
+    agent = BeliefOnly(Truth(), actor)
+    action, _ = agent.predict(obs, deterministic=True)
+    present = agent.present({key: value[None] for key, value in obs.items()})[0]
+    shown = {"observation": present, "action_history": np.zeros((2, 1)), "delay": np.zeros(1)}
+    np.testing.assert_array_equal(action, actor.predict(shown, deterministic=True)[0])
+    assert not [w for w in recwarn if "learned at ages" in str(w.message)]
+
+
+def test_what_does_not_fit_is_refused():
+    with pytest.raises(ValueError, match="expected states, or those of a DelayedObservationWrapper"):
+        BeliefOnly(Truth(), type("Other", (), {"observation_space": None})())
+    with pytest.raises(ValueError, match=r"serves delays up to 3, but the action history has 2 rows"):
+        BeliefOnly(Truth(), Sees()).predict(delayed(2).reset(seed=0)[0])

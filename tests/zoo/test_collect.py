@@ -1,0 +1,143 @@
+"""Collecting: a log of the true states, in the shares and noise asked for, that the loader reads back."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+pytest.importorskip("rl_zoo3")
+
+from logged_task import LoggedTask
+from small_run import ENV, write_run
+from stable_baselines3 import SAC
+
+from sb3_said import DelayedObservationWrapper, DelayedSAC
+from sb3_said.offline import Dataset, load_dataset
+from sb3_said.zoo import collect
+from sb3_said.zoo.collect import NoisyAgent, Recorder
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_run(tmp_path_factory.mktemp("sadr") / f"{ENV}-delay2_1", DelayedSAC, 2)
+
+
+def load(path: Path | str) -> Dataset:
+    env = gym.make(ENV)
+    return load_dataset(path, env.observation_space, env.action_space, ENV)
+
+
+def collected(path: Path, *words: str | Path) -> Dataset:
+    collect.main([*map(str, words), "-o", str(path), "--device", "cpu", "--n-envs", "3"])
+    return load(path)
+
+
+@pytest.mark.parametrize("action_delay", [0, "UniformDelay(0, 2)"])
+def test_the_log_is_what_the_task_was_in_and_given(action_delay: Any) -> None:
+    """Observations are up to three steps old, and actions may be executed late; the log shows neither."""
+    task, episodes = LoggedTask(), []
+    env = Recorder(DelayedObservationWrapper(task, delay=3, action_delay=action_delay), episodes)
+    env.action_space.seed(0)
+    for seed in range(3):
+        env.reset(seed=seed)
+        while not env.step(env.action_space.sample())[2]:
+            pass
+    data = collect.join(episodes)
+    assert data.lengths.tolist() == [12] * 3 and data.terminated.sum() == 3
+    for i, given in enumerate(task.states):
+        rows = slice(12 * i, 12 * (i + 1))
+        np.testing.assert_array_equal(np.vstack([data.states[rows], data.finals[i]]), given)
+        scaled = (np.array(task.actions[i]) - [0, 4]) / [2, 4]
+        np.testing.assert_allclose(data.actions[rows], scaled, atol=1e-6)
+        np.testing.assert_allclose(data.rewards[rows], np.array(task.actions[i])[:, 0], atol=1e-6)
+
+
+def test_shares_are_equal_repeatable_and_cut_where_they_are_full(run: Path, tmp_path: Path) -> None:
+    words = (run, "random", "--noise", "0", "0.5", "--steps", "203", "--seed", "5")
+    data, again = collected(tmp_path / "a.npz", *words), collected(tmp_path / "b.npz", *words)
+    assert len(data) == 203
+    for name in ("states", "actions", "rewards", "terminated", "ends", "finals"):
+        np.testing.assert_array_equal(getattr(data, name), getattr(again, name))
+    about = json.loads(str(np.load(tmp_path / "a.npz")["about"]))
+    told = [(share["agent"], share["noise"]) for share in about["shares"]]
+    assert told == [(str(run), 0.0), (str(run), 0.5), ("random", 0.0), ("random", 0.0)]
+    # The first share is the agent's own play, episode by episode
+    n_first = about["shares"][0]["episodes"]
+    assert data.lengths[:n_first].sum() == 203 // 4
+    played = collect.load_run(run, device="cpu").play(n_first + 3, 5, 3)
+    starts = np.concatenate([[0], np.cumsum(data.lengths)])[: n_first - 1]
+    whole = {float(data.rewards[s : s + n].sum()) for s, n in zip(starts, data.lengths, strict=False)}
+    assert whole <= set(played.returns.tolist())
+
+
+def test_a_cut_episode_is_no_terminal_and_keeps_the_state_after_it(run: Path, tmp_path: Path) -> None:
+    whole = collected(tmp_path / "whole.npz", run, "--steps", "60")
+    length = int(whole.lengths[0])
+    cut = collected(tmp_path / "cut.npz", run, "--steps", str(length - 1))
+    assert cut.ends.tolist() == [False] * (length - 2) + [True] and not cut.terminated.any()
+    np.testing.assert_array_equal(cut.finals[0], whole.states[length - 1])
+    assert whole.terminated[length - 1]
+
+
+def test_noise_has_the_size_asked_for_in_units_of_the_range() -> None:
+    class Still:
+        def predict(self, observation: Any, state: Any = None, **_: Any) -> Any:
+            return np.zeros((len(observation), 2), np.float32), state
+
+    space = gym.spaces.Box(np.float32([-10, -1]), np.float32([10, 1]))
+    actions = NoisyAgent(Still(), space, 0.1, 0).predict(np.zeros((5000, 1)))[0]
+    np.testing.assert_allclose(actions.std(0), [1.0, 0.1], rtol=0.05)
+    loud = NoisyAgent(Still(), space, 5.0, 0).predict(np.zeros((500, 1)))[0]
+    assert (np.abs(loud) <= space.high).all() and (np.abs(loud) == space.high).any()
+    drawn = NoisyAgent(None, space, 0.0, 0).predict({"observation": np.zeros((5000, 1))})[0]
+    np.testing.assert_allclose([drawn.min(0), drawn.max(0)], [space.low, space.high], rtol=0.01)
+
+
+def test_an_agent_of_sb3_goes_into_minari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    minari = pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    SAC("MlpPolicy", ENV, buffer_size=10, device="cpu", seed=0).save(tmp_path / "sac.zip")
+    words = [str(tmp_path / "sac.zip"), "--algo", "sac", "--env", ENV, "--steps", "50", "--device", "cpu"]
+    collect.main([*words, "-o", "mine/pendulum-v0"])
+    collect.main([*words, "-o", str(tmp_path / "same.npz")])
+    one, other = load("mine/pendulum-v0"), load(tmp_path / "same.npz")
+    assert len(one) == 50
+    for name in ("states", "actions", "rewards", "terminated", "ends", "finals"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    spec = minari.load_dataset("mine/pendulum-v0").spec
+    assert (spec.env_spec.id, spec.env_spec.max_episode_steps) == (ENV, gym.spec(ENV).max_episode_steps)
+    assert json.loads(minari.load_dataset("mine/pendulum-v0").storage.metadata["description"])
+    with pytest.raises(SystemExit):
+        collect.main([*words, "-o", "mine/pendulum-v0"])
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("{run} -o {tmp}/x.hdf5", "written as .npz or into Minari"),
+        ("{run} -o hopper/mine", "ends in its version: hopper/mine-v0"),
+        ("{run} -o {run}/there.npz", "is there already"),
+        ("{run} -o {tmp}/x.npz --noise -1", "--noise is a standard deviation"),
+        ("{run} -o {tmp}/x.npz --steps 0", "--steps must be at least 1"),
+        ("{run} random -o {tmp}/x.npz --steps 1", "fewer than there are shares, 2"),
+        ("random -o {tmp}/x.npz", "of no task: give --env"),
+        ("nowhere -o {tmp}/x.npz", "nowhere does not exist"),
+    ],
+)
+def test_says_what_is_wrong(
+    words: str, message: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (run / "there.npz").touch()
+    with pytest.raises(SystemExit) as stop:
+        collect.main(words.format(run=run, tmp=tmp_path).split())
+    assert stop.value.code == 2 and message in capsys.readouterr().err
+
+
+def test_random_actions_need_a_task_alone(tmp_path: Path) -> None:
+    data = collected(tmp_path / "random.npz", "random", "--env", ENV, "--steps", "300")
+    assert np.abs(data.actions.mean()) < 0.15 and 0.5 < data.actions.std() < 0.65  # uniform: 0 and 0.577
