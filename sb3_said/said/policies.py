@@ -18,6 +18,8 @@ from sb3_said.delays.space import KEYS, STATE_KEYS, UNDELAYED, check_spaces, has
 from sb3_said.offline.iql import ImplicitValues
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner.graphs import EAGER_CALLS
+from sb3_said.planner.planner import Plan
+from sb3_said.planner.selection import choose
 from sb3_said.sac.policies import DelayedSACPolicy
 
 Answer = Literal["planner", "expert"]
@@ -152,14 +154,35 @@ class SAIDPolicy(DelayedSACPolicy):
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         who = self.who_answers
         if not deterministic:
-            return self._plan(observation) if who == "planner" else super()._predict(observation)
+            return self._plan(observation).action if who == "planner" else super()._predict(observation)
         # Each row alone: matrix products of another batch size round differently, and can change the candidate chosen.
         if who == "expert":
             return th.cat([super(SAIDPolicy, self)._predict(row, True) for row in _rows(observation)])
-        return th.cat([self._plan(row, repeats=True) for row in _rows(observation)])
+        return th.cat([self._plan(row, repeats=True).action for row in _rows(observation)])
 
-    def _plan(self, observation: PyTorchObs, repeats: bool = False) -> th.Tensor:
-        """Return the decision of each row: (B, act_dim).
+    def predict_plan(self, observation: np.ndarray | dict[str, np.ndarray], deterministic: bool = False) -> np.ndarray:
+        """Return the action that :meth:`predict` does, and those planned for the steps after it.
+
+        Of candidates that are chosen from, they are the best one's; of weighed ones, their weighed mean, too.
+
+        :param observation: (B, ...), as of ``predict``
+        :return: (B, K, act_dim), in the units of the action space. K is the planner's ``horizon``; 1 where the expert
+            answers, which does not plan
+        :raises ValueError: as ``predict``
+        """
+        if self.who_answers == "expert":
+            return self.predict(observation, deterministic=deterministic)[0][:, None]
+        self.set_training_mode(False)
+        config, planned = self.planner.config, []
+        for row in _rows(self.obs_to_tensor(observation)[0]):
+            plan = self._plan(row, repeats=deterministic)
+            later = plan.actions[:, :, -config.horizon :]  # (1, N, K, act_dim)
+            chosen = choose(later.flatten(2), plan.values, config.choice_factor).view(1, *later.shape[2:])
+            planned.append(th.cat([plan.action[:, None], chosen[:, 1:]], dim=1))
+        return self._checked(self.unscale_action(th.cat(planned).cpu().numpy()), observation)
+
+    def _plan(self, observation: PyTorchObs, repeats: bool = False) -> Plan:
+        """Plan for each row.
 
         :param repeats: let the observation, of one row, decide the noise
         """
@@ -172,7 +195,7 @@ class SAIDPolicy(DelayedSACPolicy):
             states, history = observation, observation.new_zeros(len(observation), 0, self.planner.act_dim)
             delay = th.zeros(len(observation), dtype=th.long, device=observation.device)
         chooses = self.planner.config.temperature > 0  # else there is no noise and one candidate
-        plan = self.planner.plan(
+        return self.planner.plan(
             states,
             history,
             delay,
@@ -180,7 +203,6 @@ class SAIDPolicy(DelayedSACPolicy):
             noise=self._noise_of(observation) if chooses and repeats else None,
             **extra,
         )
-        return plan.action
 
     def _noise_of(self, row: PyTorchObs) -> th.Tensor:
         """Return noise that the observation alone decides: (N, L, obs_dim + act_dim).

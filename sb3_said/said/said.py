@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
@@ -194,6 +195,10 @@ class SAID(OfflineAlgorithm):
             self.policy.planner.check_ages(ages)
         else:
             super().check_ages(ages)
+
+    def predict_plan(self, observation: Any, deterministic: bool = False) -> np.ndarray:
+        """Return the action to execute and those planned after it: see :meth:`SAIDPolicy.predict_plan`."""
+        return self.policy.predict_plan(observation, deterministic)
 
     def warmup(self, batch_size: int = 1) -> None:
         """Run a few dummy predictions: see :meth:`SAIDPolicy.warmup`. A control loop calls it once before it starts.
