@@ -157,6 +157,10 @@ class Ledger:
             self._last, self.n_missing = actions[-1], n_late - len(actions)
         return n_late
 
+    def is_planned(self, number: int) -> bool:
+        """Tell whether an answer covers an action."""
+        return number in self._planned
+
     def next_step(self) -> Step:
         """Return what to send next. An observation that is too old discards what is planned."""
         if self.observation is not None and self.age > self.max_age:

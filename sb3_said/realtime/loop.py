@@ -110,7 +110,7 @@ class ControlLoop:
         self._statistics = LoopStatistics()
         self._acted = math.nan  # when
         self._is_due = self._has_heard = self._is_closing = False  # to ask; an observation since the last act
-        self._is_busy = simulate is None
+        self._is_busy, self._stands = simulate is None, False  # and the next answer is waited for
         self._error: BaseException | None = None
         self._in_flight: tuple[Request, np.ndarray, int] | None = None  # of a simulation, and when it arrives
         if simulate is not None:
@@ -148,7 +148,7 @@ class ControlLoop:
         """
         with self._changed:
             self._ledger.start_episode(-math.inf if now is None else now)
-            self._is_due = self._has_heard = False
+            self._is_due = self._has_heard = self._stands = False
             self._in_flight, self._acted = None, math.nan
 
     def observe(self, observation: Any, capture_time: float | None = None, n_executed: int | None = None) -> None:
@@ -200,20 +200,24 @@ class ControlLoop:
             if not self._has_heard:  # ask again: the same observation is a step older
                 self._is_due = True
                 self._changed.notify_all()
-            self._has_heard, self._acted = False, now
+            self._has_heard, self._stands, self._acted = False, False, now
             return step.action.copy()
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Block until the model is idle, as before an episode that should begin with a plan; tell whether it is.
+        """Block until the model is idle, and tell whether it is.
+
+        Before the first action of an episode the robot stands, so that no action is sent meanwhile: then the answer
+        that this waits for begins with that one.
 
         :param timeout: in seconds; None for no limit
         :raises RuntimeError: where the model has failed, or the loop is closed
         """
         with self._changed:
-            idle = self._changed.wait_for(
-                lambda: self._simulate is not None or self._has_stopped or not (self._is_busy or self._is_due), timeout
-            )
-            self._check()
+            idle = self._idle(timeout)
+            if idle and self._simulate is None and self.n_sent == 0 and not self._ledger.is_planned(0):
+                self._stands = self._is_due = True
+                self._changed.notify_all()
+                idle = self._idle(timeout)
             return idle
 
     def close(self) -> None:
@@ -224,9 +228,17 @@ class ControlLoop:
         if self._simulate is None and self._worker is not threading.current_thread():
             self._worker.join()
 
-    @property
-    def _has_stopped(self) -> bool:
-        return self._is_closing or self._error is not None
+    def _idle(self, timeout: float | None) -> bool:
+        def is_over() -> bool:
+            has_stopped = self._is_closing or self._error is not None
+            return has_stopped or self._simulate is not None or not (self._is_busy or self._is_due)
+
+        idle = self._changed.wait_for(is_over, timeout)
+        self._check()
+        return idle
+
+    def _next_request(self) -> Request | None:
+        return self._ledger.request(self.answer_steps if self.count_latency and not self._stands else 0)
 
     def _check(self) -> None:
         if self._error is not None:
@@ -259,7 +271,7 @@ class ControlLoop:
                     self._changed.wait_for(lambda: self._is_closing or self._is_due)
                     if self._is_closing:
                         return
-                    request, self._is_due = self._ledger.request(self.answer_steps if self.count_latency else 0), False
+                    request, self._is_due, self._stands = self._next_request(), False, False
                     self._is_busy = True
                 if request is not None:
                     actions, _ = self._asking.answer(request)
@@ -278,7 +290,7 @@ class ControlLoop:
                 self._in_flight = None
                 self._take(request, actions)
             if may_ask and self._in_flight is None:
-                asked = self._ledger.request(self.answer_steps if self.count_latency else 0)
+                asked = self._next_request()
                 if asked is not None:
                     actions, seconds = self._asking.answer(asked)
                     self._in_flight = asked, actions, self.n_sent + busy_steps(seconds)

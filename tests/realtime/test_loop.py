@@ -55,7 +55,7 @@ def test_an_answer_of_another_episode_is_dropped():
 
 def test_an_observation_that_comes_while_the_model_computes_is_answered_next():
     model = Gated(TASK, 4)
-    with ControlLoop(model, 1) as loop:
+    with ControlLoop(model, 1, answer_steps=0) as loop:
         model.asked.clear()
         model.gate.clear()
         model.is_computing.clear()
@@ -81,6 +81,22 @@ def test_where_no_observation_comes_the_last_is_asked_about_again_a_step_older()
         0,
         2,
     ]  # not after act(0), which had heard of it; 3 is too old
+
+
+def test_a_robot_that_stands_until_the_plan_is_there_begins_with_it():
+    model = Planning(TASK, 4)
+    with ControlLoop(model, 1, answer_steps=2) as loop:
+        for _ in range(2):
+            loop.reset()
+            model.asked.clear()
+            assert loop.wait(60) and model.asked == []  # nothing has been seen
+            loop.observe(ZEROS, n_executed=0)
+            assert loop.wait(60) and loop.wait(60)
+            assert [int(asked["delay"][0]) for asked in model.asked] == [2, 0]  # on the move, and standing
+            wanted = plan_of(model.asked[-1], TASK.action_space, 4)
+            np.testing.assert_array_equal([loop.act(t) for t in range(2)], wanted[:2])
+            assert loop.wait(60) and int(model.asked[-1]["delay"][0]) == 4
+        assert loop.statistics().waiting_steps == 0
 
 
 def test_threads_that_observe_act_and_answer_at_once_keep_the_books_right():
