@@ -146,10 +146,9 @@ def delay_name(process: DelayProcess) -> int | str:
 
 
 def answers(model: BaseAlgorithm) -> list[str | None]:
-    """Return who can answer: SAID's expert, and its planner once that is trained; None for another agent alone."""
-    if not hasattr(model.policy, "answering"):
-        return [None]
-    return [who for who in ANSWERS if who != "planner" or model.policy.planner_is_trained]
+    """Return who can answer in a SAID agent; None for another agent alone."""
+    found: list[str | None] = list(getattr(model.policy, "answers", [None]))
+    return found
 
 
 def answering(model: BaseAlgorithm, answer: str | None) -> AbstractContextManager[Any]:
