@@ -173,11 +173,24 @@ class SAIDPolicy(DelayedSACPolicy):
         observation: PyTorchObs = flat if self.replay_space is None else {UNDELAYED: flat}
         return th.cat(self.critic(observation, actions.flatten(0, -2)), dim=1).amin(1).view(states.shape[:-1])
 
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        if self.who_answers != "student":
+            return super().predict(observation, state, episode_start, deterministic)
+        assert self.student is not None
+        tensors, is_batch = self.obs_to_tensor(observation)  # SB3's way would set the mode of every module first
+        with th.inference_mode():
+            answers = th.cat([self.student(row) for row in _rows(tensors)]).cpu().numpy()
+        actions = self._checked(self.unscale_action(answers), observation)
+        return actions if is_batch else actions[0], state
+
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         who = self.who_answers
-        if who == "student":
-            assert self.student is not None
-            return th.cat([self.student(row) for row in _rows(observation)])
         if not deterministic:
             return self._plan(observation).action if who == "planner" else super()._predict(observation)
         # Each row alone: matrix products of another batch size round differently, and can change the candidate chosen.

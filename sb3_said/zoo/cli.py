@@ -14,6 +14,7 @@ usage: sb3-said COMMAND ...
   over-delays  play trained agents under several delays: a table and a plot of return over delay
   tune         search the planner's depth, temperature, denoising steps and choice factor for a trained run
   decide       set how a trained agent decides: temperature, candidates, denoising steps, choice factor
+  export       write a distilled student as an ONNX file, for computers without PyTorch
 
 sb3-said COMMAND --help shows the options of a command, with examples. A first try,
 of a few minutes (five on two slow cores):
@@ -21,7 +22,7 @@ of a few minutes (five on two slow cores):
   sb3-said train --algo said --env Pendulum-v1 --delay 2 --preset smoke --seed 1
   sb3-said evaluate logs/said/Pendulum-v1-delay2-seed1_1
 """
-COMMANDS = ("train", "evaluate", "enjoy", "over-delays", "tune", "decide")
+COMMANDS = ("train", "evaluate", "enjoy", "over-delays", "tune", "decide", "export")
 
 
 def main() -> None:

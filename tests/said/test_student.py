@@ -14,7 +14,7 @@ from sb3_said.sac.extractors import StateAugmentedExtractor
 from sb3_said.said import student as student_module
 from sb3_said.said.student import Distillation, Student
 
-QUICK = {"width": 32, "n_labels": 1500, "own_steps": 60, "rounds": 2, "gradient_steps": 400, "batch_size": 64}
+QUICK = {"width": 32, "n_labels": 700, "own_steps": 60, "rounds": 2, "gradient_steps": 400, "batch_size": 64}
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def test_it_answers_as_the_planner_and_an_untaught_one_does_not(taught):
     untaught = Student(taught.observation_space, taught.action_space, 32)(taught.policy.obs_to_tensor(obs)[0])
     error, spread = np.abs(found - wanted).max(), np.abs(wanted - wanted.mean(0)).max()
     assert spread > 0.2 and error < 0.15 * spread < np.abs(2 * untaught.detach().numpy() - wanted).max()
-    assert 0 < taught.error < 0.1
+    assert 0 < taught.error < 0.15
 
 
 def test_the_labels_are_the_planners_at_temperature_0_at_every_age(taught, monkeypatch):
