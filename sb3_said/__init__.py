@@ -26,7 +26,7 @@ __all__ = [
     "StableSAC",
 ]
 _HOMES = ("delays", "planner", "sac", "said")  # of these names, each after those it imports
-_FOLDERS = (*_HOMES, "replay", "files", "offline", "evaluation", "zoo")
+_FOLDERS = (*_HOMES, "replay", "files", "offline", "evaluation", "realtime", "zoo")
 
 
 def __getattr__(name: str) -> Any:

@@ -21,7 +21,8 @@ MAY_IMPORT = {
     "said": {"delays", "replay", "planner", "files", "sac", "offline"},
     "offline": {"delays", "replay", "planner", "files", "sac"},
     "evaluation": set(),
-    "zoo": {"", "delays", "replay", "planner", "files", "sac", "said", "offline", "evaluation"},
+    "realtime": {"delays"},
+    "zoo": {"", "delays", "replay", "planner", "files", "sac", "said", "offline", "evaluation", "realtime"},
 }
 
 
@@ -63,6 +64,7 @@ def test_no_modules_import_each_other_in_a_circle():
         ("from sb3_said import DelayedObservationWrapper", {"torch", "stable_baselines3"}),
         ("import sb3_said.planner", {"stable_baselines3", "gymnasium"}),
         ("import sb3_said; sb3_said.evaluation.rollout", {"torch", "stable_baselines3", "matplotlib"}),
+        ("import sb3_said.realtime", {"torch", "stable_baselines3"}),
     ],
 )
 def test_a_room_does_without_what_it_does_not_need(statement, without):

@@ -160,13 +160,20 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         :raises ValueError: as :meth:`obs_to_tensor`, and for an action that is not finite
         """
         actions, state = super().predict(observation, state, episode_start, deterministic)
+        return self._checked(actions, observation), state
+
+    def _checked(self, actions: np.ndarray, observation: np.ndarray | dict[str, np.ndarray]) -> np.ndarray:
+        """Return an answer, (..., act_dim) in the units of the action space, within its bounds.
+
+        :raises ValueError: for an action that is not finite
+        """
         if not np.isfinite(actions).all():
             parts = observation.values() if isinstance(observation, dict) else [observation]
             largest = max(float(np.abs(part).max(initial=0.0)) for part in parts)
             raise ValueError(f"{NOT_FINITE} The largest entry of the observation is {largest:.3g}.")
         space = self.action_space
         assert isinstance(space, spaces.Box)  # as check_spaces says
-        return np.clip(actions, space.low, space.high), state  # scaling to the bounds may round to beyond them
+        return np.clip(actions, space.low, space.high)  # scaling to the bounds may round to beyond them
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         actor = self.averaged_actor if self._answers_as_average else self.actor

@@ -17,9 +17,12 @@ from sb3_said.delays.space import KEYS, STATE_KEYS, UNDELAYED, check_spaces, has
 from sb3_said.offline.iql import ImplicitValues
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner.graphs import EAGER_CALLS
+from sb3_said.planner.planner import Plan
+from sb3_said.planner.selection import choose
 from sb3_said.sac.policies import DelayedSACPolicy, rows_of, seed_of
+from sb3_said.said.student import Student
 
-Answer = Literal["planner", "expert"]
+Answer = Literal["planner", "expert", "student"]
 Value = Literal["critics", "iql"]
 
 
@@ -32,6 +35,7 @@ class SAIDPolicy(DelayedSACPolicy):
     :param planner_kwargs: fields of :class:`~sb3_said.planner.PlannerConfig`
     :param value: who values planned states: ``"critics"``, the expert's, by min Q(s, a); or ``"iql"``, a V(s) of its
         own (see :class:`~sb3_said.offline.ImplicitValues`)
+    :param student_width: of the hidden layers of a :class:`~sb3_said.said.student.Student`; None for none
     :param policy_kwargs: of :class:`~sb3_said.sac.DelayedSACPolicy`
     :raises ValueError: for an unknown planner setting, a delayed task whose critics do not read the true state, or a
         ``state_history`` that the planner is not trained to read
@@ -48,6 +52,7 @@ class SAIDPolicy(DelayedSACPolicy):
         *,
         planner_kwargs: dict[str, Any] | None = None,
         value: Value = "critics",
+        student_width: int | None = None,
         **policy_kwargs: Any,
     ):
         super().__init__(observation_space, action_space, lr_schedule, **policy_kwargs)
@@ -64,6 +69,7 @@ class SAIDPolicy(DelayedSACPolicy):
         with th.random.fork_rng(devices=[]):  # the expert learns as it would without a planner
             self.make_planner(PlannerConfig(**given))
             self.set_value(value)
+            self.make_student(student_width)
         if has_state_history(observation_space) and self.planner.config.extra_state_probability == 0:
             raise ValueError(
                 "Observations have a state_history, but the planner is not trained with extra known states; give "
@@ -92,6 +98,12 @@ class SAIDPolicy(DelayedSACPolicy):
             state_space, _ = check_spaces(self.observation_space, self.action_space)
             self.values = ImplicitValues(state_space.shape[0], self.action_space.shape[0]).to(self.device)  # type: ignore[index]  # a Box has a shape
 
+    def make_student(self, width: int | None) -> None:
+        """Take a new, untrained student, or none."""
+        assert isinstance(self.action_space, spaces.Box)  # as check_spaces says
+        student = None if width is None else Student(self.observation_space, self.action_space, width).to(self.device)
+        self.student: Student | None = student
+
     @property
     def planner_is_trained(self) -> bool:
         """Whether the planner has been trained, and so can answer."""
@@ -100,23 +112,33 @@ class SAIDPolicy(DelayedSACPolicy):
     @property
     def who_answers(self) -> Answer:
         """Who answers ``predict``."""
+        if self._answer is None and self.student is not None and self.student.preferred:
+            return "student"
         return self._answer or ("planner" if self.planner_is_trained and not self.expert_preferred else "expert")
 
-    def set_answer(self, who: Answer) -> None:
-        """Let the planner or the expert answer ``predict`` from now on; a file keeps it.
+    @property
+    def answers(self) -> list[Answer]:
+        """Who can answer ``predict``."""
+        can = {"planner": self.planner_is_trained, "expert": True, "student": self.student is not None}
+        return [who for who in get_args(Answer) if can[who]]
 
-        :param who: ``"planner"`` or ``"expert"``
-        :raises ValueError: for another name, or for a planner that is not trained
+    def set_answer(self, who: Answer) -> None:
+        """Let one of them answer ``predict`` from now on; a file keeps it.
+
+        :param who: ``"planner"``, ``"expert"`` or ``"student"``
+        :raises ValueError: for another name, for a planner that is not trained, or for no student
         """
         self._check_answer(who)
         self.expert_preferred.fill_(float(who == "expert"))
+        if self.student is not None:
+            self.student.preferred.fill_(float(who == "student"))
 
     @contextmanager
     def answering(self, who: Answer) -> Iterator[None]:
-        """Let the planner or the expert answer ``predict`` for a while, whichever would otherwise.
+        """Let one of them answer ``predict`` for a while, whoever would otherwise.
 
-        :param who: ``"planner"`` or ``"expert"``
-        :raises ValueError: for another name, or for a planner that is not trained
+        :param who: ``"planner"``, ``"expert"`` or ``"student"``
+        :raises ValueError: for another name, for a planner that is not trained, or for no student
         """
         self._check_answer(who)
         before, self._answer = self._answer, who
@@ -127,9 +149,11 @@ class SAIDPolicy(DelayedSACPolicy):
 
     def _check_answer(self, who: Answer) -> None:
         if who not in get_args(Answer):
-            raise ValueError(f"Only the 'planner' or the 'expert' can answer, got {who!r}.")
+            raise ValueError(f"Only the 'planner', the 'expert' or a 'student' can answer, got {who!r}.")
         if who == "planner" and not self.planner_is_trained:
             raise ValueError("The planner is not trained yet; call learn() or train_planner() first.")
+        if who == "student" and self.student is None:
+            raise ValueError("There is no student yet; call distill() first.")
 
     def value(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """Return V(s), or min over the critics of Q(s, a), which scores candidates (MCSS).
@@ -149,17 +173,54 @@ class SAIDPolicy(DelayedSACPolicy):
         values = th.cat(self.critic(observation, actions.flatten(0, -2)), dim=1).amin(1).view(states.shape[:-1])
         return values if self.return_scale is None else values * self.return_scale.value
 
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        if self.who_answers != "student":
+            return super().predict(observation, state, episode_start, deterministic)
+        assert self.student is not None
+        tensors, is_batch = self.obs_to_tensor(observation)  # SB3's way would set the mode of every module first
+        with th.inference_mode():
+            answers = th.cat([self.student(row) for row in rows_of(tensors)]).cpu().numpy()
+        actions = self._checked(self.unscale_action(answers), observation)
+        return actions if is_batch else actions[0], state
+
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         who = self.who_answers
         if not deterministic:
-            return self._plan(observation) if who == "planner" else super()._predict(observation)
+            return self._plan(observation).action if who == "planner" else super()._predict(observation)
         # Each row alone: matrix products of another batch size round differently, and can change the candidate chosen.
         if who == "expert":
             return th.cat([super(SAIDPolicy, self)._predict(row, True) for row in rows_of(observation)])
-        return th.cat([self._plan(row, repeats=True) for row in rows_of(observation)])
+        return th.cat([self._plan(row, repeats=True).action for row in rows_of(observation)])
 
-    def _plan(self, observation: PyTorchObs, repeats: bool = False) -> th.Tensor:
-        """Return the decision of each row: (B, act_dim).
+    def predict_plan(self, observation: np.ndarray | dict[str, np.ndarray], deterministic: bool = False) -> np.ndarray:
+        """Return the action that :meth:`predict` does, and those planned for the steps after it.
+
+        Of candidates that are chosen from, they are the best one's; of weighed ones, their weighed mean, too.
+
+        :param observation: (B, ...), as of ``predict``
+        :return: (B, K, act_dim), in the units of the action space. K is the planner's ``horizon``; 1 where the planner
+            does not answer
+        :raises ValueError: as ``predict``
+        """
+        if self.who_answers != "planner":
+            return self.predict(observation, deterministic=deterministic)[0][:, None]
+        self.set_training_mode(False)
+        config, planned = self.planner.config, []
+        for row in rows_of(self.obs_to_tensor(observation)[0]):
+            plan = self._plan(row, repeats=deterministic)
+            later = plan.actions[:, :, -config.horizon :]  # (1, N, K, act_dim)
+            chosen = choose(later.flatten(2), plan.values, config.choice_factor).view(1, *later.shape[2:])
+            planned.append(th.cat([plan.action[:, None], chosen[:, 1:]], dim=1))
+        return self._checked(self.unscale_action(th.cat(planned).cpu().numpy()), observation)
+
+    def _plan(self, observation: PyTorchObs, repeats: bool = False) -> Plan:
+        """Plan for each row.
 
         :param repeats: let the observation, of one row, decide the noise
         """
@@ -172,7 +233,7 @@ class SAIDPolicy(DelayedSACPolicy):
             states, history = observation, observation.new_zeros(len(observation), 0, self.planner.act_dim)
             delay = th.zeros(len(observation), dtype=th.long, device=observation.device)
         chooses = self.planner.config.temperature > 0  # else there is no noise and one candidate
-        plan = self.planner.plan(
+        return self.planner.plan(
             states,
             history,
             delay,
@@ -180,7 +241,6 @@ class SAIDPolicy(DelayedSACPolicy):
             noise=self._noise_of(observation) if chooses and repeats else None,
             **extra,
         )
-        return plan.action
 
     def _noise_of(self, row: PyTorchObs) -> th.Tensor:
         """Return noise that the observation alone decides: (N, L, obs_dim + act_dim).
@@ -223,4 +283,5 @@ class SAIDPolicy(DelayedSACPolicy):
             **super()._get_constructor_parameters(),
             "planner_kwargs": self.planner.config.to_dict(),
             "value": "critics" if self.values is None else "iql",
+            "student_width": None if self.student is None else self.student.width,
         }

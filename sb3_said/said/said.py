@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
@@ -24,6 +25,7 @@ from sb3_said.planner.values import returns_to_go
 from sb3_said.sac import StableSAC
 from sb3_said.said.callbacks import PlannerTrainingCallback
 from sb3_said.said.policies import Answer, SAIDPolicy, Value
+from sb3_said.said.student import Distillation, distill
 from sb3_said.said.training import PlannerTraining
 from sb3_said.said.trial import let_the_better_answer
 
@@ -57,6 +59,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         with the expert; the better one answers. They come on top of ``learn``'s steps. 0: the planner answers
     :param value: who scores the planner's candidates: ``"critics"``, the expert's, by min Q(s, a); or ``"iql"``, a
         V(s) that is learned beside the planner by implicit Q-learning, which is what offline learning has
+    :param student_width: of the hidden layers of the student that :meth:`distill` trains; None before
     :param sac_kwargs: every other argument of :class:`~sb3_said.sac.StableSAC`, the expert, and of SB3's ``SAC``
     :raises ValueError: as ``DelayedSAC`` does, for planner settings outside their range, and for a ``state_history``
         in the observations that the planner is not trained to read or that ``VecNormalize`` leaves unscaled
@@ -79,6 +82,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         planner_terminal_penalty: float | None = None,
         planner_trial_episodes: int = 5,
         value: Value = "critics",
+        student_width: int | None = None,
         **sac_kwargs: Any,
     ):
         for name, count in (("gradient_steps", planner_gradient_steps), ("train_freq", planner_train_freq)):
@@ -97,6 +101,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         self.planner_terminal_penalty = planner_terminal_penalty
         self.planner_trial_episodes = planner_trial_episodes
         self.value = value
+        self.student_width = student_width
         self._planner_trained_at = 0  # num_timesteps of the last planner training
         super().__init__(policy, env, learning_rate, **sac_kwargs)
 
@@ -124,7 +129,8 @@ class SAID(OfflineAlgorithm, StableSAC):
                 warnings.warn(str(error), stacklevel=3)
 
     def _policy_flags(self) -> dict[str, Any]:
-        return {**super()._policy_flags(), "planner_kwargs": self.planner_kwargs, "value": self.value}
+        student = {"student_width": self.student_width}
+        return {**super()._policy_flags(), "planner_kwargs": self.planner_kwargs, "value": self.value, **student}
 
     def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:
         """Keep this agent's own planner where the given one was never trained and has other settings."""
@@ -183,7 +189,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         self.policy.planner.config = replace(self.policy.planner.config, **settings)
 
     def set_answer(self, who: Answer) -> None:
-        """Let the planner or the expert answer ``predict`` from now on: see :meth:`SAIDPolicy.set_answer`."""
+        """Let one of them answer ``predict`` from now on: see :meth:`SAIDPolicy.set_answer`."""
         self.policy.set_answer(who)
 
     def check_ages(self, ages: list[int]) -> None:
@@ -192,10 +198,43 @@ class SAID(OfflineAlgorithm, StableSAC):
         :param ages: that it will meet amid episodes, in control steps
         :raises ValueError: as :meth:`InpaintingPlanner.check_ages`
         """
-        if self.policy.who_answers == "planner":  # its masks were drawn from all of 0..D, so it has met every age
+        if self.policy.who_answers != "expert":  # masks were drawn from all of 0..D, so it has met every age
             self.policy.planner.check_ages(ages)
         else:
             super().check_ages(ages)
+
+    def distill(self, width: int = 256, **settings: Any) -> float:
+        """Train a student: a plain network that answers as the planner does at temperature 0, much faster.
+
+        It learns from the planner's answers to observations of the replay, at every age, and to those that it visits
+        itself in the training environment. ``save`` keeps it. To use it, ``set_answer("student")``. It does not change
+        where the planner is trained again.
+
+        :param width: of its two hidden layers
+        :param settings: fields of :class:`~sb3_said.said.student.Distillation`, such as ``n_labels`` or ``q_weight``
+        :return: root mean square of its error over held-out answers of the planner, in actions in [-1, 1]
+        :raises ValueError: without a trained planner, or without both a replay and an environment
+        """
+        config = Distillation(**settings)
+        self.policy._check_answer("planner")
+        if self.env is None and (self.replay_buffer is None or self.replay_buffer.size() == 0):
+            raise ValueError("Nothing to learn from: the replay is empty, as after load(); give load(..., env=env).")
+        before = self.policy.student
+        with th.random.fork_rng(devices=[]):
+            th.manual_seed(self.seed or 0)
+            self.policy.make_student(width)
+            try:
+                error = distill(self, config)
+            except BaseException:
+                self.policy.student = before
+                raise
+        self.policy.student.requires_grad_(False)  # type: ignore[union-attr]  # just made
+        self.student_width = width
+        return error
+
+    def predict_plan(self, observation: Any, deterministic: bool = False) -> np.ndarray:
+        """Return the action to execute and those planned after it: see :meth:`SAIDPolicy.predict_plan`."""
+        return self.policy.predict_plan(observation, deterministic)
 
     def warmup(self, batch_size: int = 1) -> None:
         """Run a few dummy predictions: see :meth:`SAIDPolicy.warmup`. A control loop calls it once before it starts.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -12,6 +12,7 @@ from tqdm.auto import tqdm
 from sb3_said.said.policies import Answer
 
 SAID = Any  # whose module imports this one
+RIVALS: tuple[Answer, ...] = ("planner", "expert")
 
 
 def play_trial(model: SAID, n_episodes: int, progress_bar: bool = False) -> dict[Answer, np.ndarray]:
@@ -31,7 +32,7 @@ def play_trial(model: SAID, n_episodes: int, progress_bar: bool = False) -> dict
         normalizer.training = False
     returns: dict[Answer, np.ndarray] = {}
     try:
-        for who in get_args(Answer):
+        for who in RIVALS:
             with model.policy.answering(who), tqdm(total=n_episodes, desc=who, disable=not progress_bar) as bar:
 
                 def show(played: dict[str, Any], _: dict[str, Any], bar: Any = bar) -> None:

@@ -16,6 +16,7 @@ usage: sb3-said COMMAND ...
   decide       set how a trained agent decides: temperature, candidates, denoising steps, choice factor
   card         write a model card for an agent's file, from what was measured of it
   collect      let trained agents play, and log it as a dataset to learn from
+  export       write a distilled student as an ONNX file, for computers without PyTorch
 
 sb3-said COMMAND --help shows the options of a command, with examples. A first try,
 of a few minutes (five on two slow cores):
@@ -23,7 +24,7 @@ of a few minutes (five on two slow cores):
   sb3-said train --algo said --env Pendulum-v1 --delay 2 --preset smoke --seed 1
   sb3-said evaluate logs/said/Pendulum-v1-delay2-seed1_1
 """
-COMMANDS = ("train", "evaluate", "enjoy", "over-delays", "tune", "decide", "card", "collect")
+COMMANDS = ("train", "evaluate", "enjoy", "over-delays", "tune", "decide", "card", "collect", "export")
 
 
 def main() -> None:

@@ -15,6 +15,7 @@ from sb3_said.evaluation import Summary, collect_observations, measure_latency, 
 from sb3_said.files.atomic import write_json
 from sb3_said.offline import normalized_score, reference_returns
 from sb3_said.zoo.arguments import TRUST, add_run, check_positive, explained, make_parser, read_delay
+from sb3_said.zoo.latency import control_period, evaluate_in_real_time
 from sb3_said.zoo.runs import LoadedRun, answering, answers, load_run, origin
 
 EPILOG = f"""\
@@ -28,11 +29,18 @@ examples:
   # an agent that came without its run folder
   sb3-said evaluate hopper.zip --algo said --env Hopper-v5 --delay 4
 
+  # the same in real time: the task does not wait for answers, so their time on this machine is delay
+  sb3-said evaluate logs/said/Hopper-v5-delay4-seed1_1 --realtime --period 0.02
+
 Episode i starts from reset seed --seed + i, so two agents meet the same starts; --n-envs changes only the speed. A
 return is the undiscounted sum of the task's own rewards, and a score is D4RL's, 0 for a random policy and 100 for an
 expert, where D4RL has both. Decisions are timed after the episodes, one at a time, from NumPy observation to NumPy
 action. The last agent of a run is played, and where an earlier one did best in training, that "best" one too: it was
 chosen on other episodes than these.
+
+With --realtime every answer is also made to wait: it takes effect at the first control step after the time that it
+took. The row "in real time" plans for that step. The row "latency ignored" plans for the step at which it was asked,
+and shows what that costs. Both hold the last action in between. Other programs on this machine count, too.
 {TRUST}
 """
 
@@ -44,31 +52,46 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--latency-calls", type=int, default=200, help="decisions to time, 0 for none (default: 200)")
     parser.add_argument("--json", type=Path, help="where to write the numbers (default: RUN/evaluation.json)")
     parser.add_argument("--plot", type=Path, help="draw returns and training curves to this .png or .pdf")
+    parser.add_argument("--realtime", action="store_true", help="play also without waiting for answers; --delay, 0 by "
+                        "default, is then the delay without them")  # fmt: skip
+    parser.add_argument("--period", type=float, metavar="SECONDS", help="of a control step with --realtime (default: "
+                        "the task's own)")  # fmt: skip
     args = parser.parse_args(argv)
     with explained(parser):
         check_positive(args, "episodes", "n_envs", "num_threads")
+        if args.period is not None and not (args.realtime and args.period > 0):
+            raise ValueError(f"--period takes seconds above 0 and needs --realtime, got {args.period}.")
         th.set_num_threads(args.num_threads)
         if args.plot is not None:
             plots.panels()  # without matplotlib, fail now and not after the episodes
-        how_played = args.algo, args.env, read_delay(args.delay), args.device, None, args.gym_packages
+        delay = 0 if args.realtime and not args.delay else read_delay(args.delay)
+        how_played = args.algo, args.env, delay, args.device, None, args.gym_packages
         run = load_run(args.run, *how_played)
         runs = {"last": run}
         if Path(args.run).is_dir() and (best := run.folder / "best_model.zip").is_file():
             runs["best"] = load_run(best, *how_played)
             if runs["best"].info["trained_steps"] == run.info["trained_steps"]:
                 del runs["best"]  # the last one is the best
+        period = control_period(run) if args.realtime and args.period is None else args.period
 
     last_seed = args.seed + args.episodes - 1
     print(f"{run.info['algo']} on {run.info['env']}, delay {run.info['delay']}, reset seeds {args.seed}..{last_seed}")
     settings = {"seed": args.seed, "n_envs": args.n_envs, "deterministic": not args.stochastic}
     how = {**settings, "latency_calls": args.latency_calls}
-    played = [
-        (which, evaluate(one, answer, args.episodes, **how))
-        for which, one in runs.items()
-        for answer in answers(one.model)
-    ]
+    played: list[tuple[str, Summary]] = []
+    counted: dict[str, dict[str, float]] = {}
+    for which, one in runs.items():
+        for answer in answers(one.model):
+            played.append((which, evaluate(one, answer, args.episodes, **how)))
+            if args.realtime:
+                in_time = evaluate_in_real_time(one, answer, args.episodes, args.seed, period, not args.stochastic)
+                for summary, counts in in_time:
+                    played.append((which, summary))
+                    counted[summary.label if which == "last" else f"{summary.label}, best"] = counts
     rows = [replace(s, label=s.label if which == "last" else f"{s.label}, best") for which, s in played]
     print_table(rows, run.info["env"])
+    for label, counts in counted.items():
+        print(f"{label}: {', '.join(f'{name} {value:g}' for name, value in counts.items() if 'gap' not in name)}")
 
     document = {**run.info, "n_episodes": args.episodes, **settings}
     document["results"] = [
@@ -77,6 +100,7 @@ def main(argv: list[str] | None = None) -> None:
         for which, summary in played
     ]
     document["origin"] = origin(run)
+    document |= {"period": period, "realtime": counted} if args.realtime else {}
     target = args.json or run.folder / "evaluation.json"
     write_json(target, document)
     print(f"Wrote {target}")
@@ -120,15 +144,15 @@ def print_table(summaries: list[Summary], env_id: str = "") -> None:
 
     :param env_id: of a task, for the score
     """
-    print(f"{'':15} {'mean return':>12} {'95 % interval':>24} {'score':>7} {'length':>8}   decision latency")
+    width = max(10, *(len(s.label) for s in summaries))
+    print(f"{'':{width}} {'mean return':>12} {'95 % interval':>24} {'score':>7} {'length':>8}   decision latency")
     for s in summaries:
         interval = f"[{s.mean_return.low:,.1f}, {s.mean_return.high:,.1f}]"
         speed = "not measured" if s.latency is None else str(s.latency)
         scores = score_of(s, env_id)
         score = "-" if scores is None else f"{scores[0]:.1f}"
-        print(
-            f"{s.label:15} {s.mean_return.value:12,.1f} {interval:>24} {score:>7} {s.mean_length.value:8,.1f}   {speed}"
-        )
+        numbers = f"{s.mean_return.value:12,.1f} {interval:>24} {score:>7} {s.mean_length.value:8,.1f}"
+        print(f"{s.label:{width}} {numbers}   {speed}")
 
 
 def draw(path: Path, summaries: list[Summary], folder: Path, title: str) -> None:

@@ -176,14 +176,12 @@ def delay_name(process: DelayProcess) -> int | str:
 
 
 def answers(model: BaseAlgorithm) -> list[str | None]:
-    """Return who can answer: SAID's planner once it is trained, and its expert; None for another agent alone.
+    """Return who can answer in a SAID agent; None for another agent alone.
 
     An expert that made no update, as after learning from logs, answers only where there is nobody else.
     """
-    if not hasattr(model.policy, "answering"):
-        return [None]
-    learned = {"planner": model.policy.planner_is_trained, "expert": model._n_updates > 0}
-    return [who for who in ANSWERS if learned[who]] or ["expert"]
+    found: list[str | None] = list(getattr(model.policy, "answers", [None]))
+    return [who for who in found if who != "expert" or model._n_updates > 0] or found
 
 
 def answering(model: BaseAlgorithm, answer: str | None) -> AbstractContextManager[Any]:

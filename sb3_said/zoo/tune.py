@@ -20,12 +20,13 @@ from sb3_said import SAID
 from sb3_said.evaluation import Latency, Summary
 from sb3_said.files.atomic import write_json
 from sb3_said.files.checkpoint import CHECKPOINT_NAME
+from sb3_said.said.trial import RIVALS
 from sb3_said.zoo.arguments import TRUST, check_positive, explained, make_parser
 from sb3_said.zoo.best import write_best
 from sb3_said.zoo.depths import DepthPlanners
 from sb3_said.zoo.evaluate import evaluate, print_table
 from sb3_said.zoo.record import Record
-from sb3_said.zoo.runs import LoadedRun, answers, load_run, origin
+from sb3_said.zoo.runs import LoadedRun, load_run, origin
 from sb3_said.zoo.search import DRAWN, describe, find_winner, finished, open_study, returns_of, save_plot, search
 
 EPILOG = f"""\
@@ -188,7 +189,7 @@ def report(args: argparse.Namespace, run: LoadedRun, study: Study, winner: Froze
         played = before["results"]
     else:
         how = (args.report_episodes, args.report_seed)
-        played = [evaluate(run, answer, *how, latency_calls=100).to_dict() for answer in answers(run.model)]
+        played = [evaluate(run, answer, *how, latency_calls=100).to_dict() for answer in RIVALS]
     run.model.save(folder / "best.zip")
     trials = [trial_to_dict(trial) for trial in finished(study)]
     choice = f"the best of {len(trials)} trials, mean return {winner.value:.1f} over {args.episodes} episodes"

@@ -347,3 +347,40 @@ def test_extra_states_that_could_not_be_used_are_refused():
         model.set_env(vec_env)
     assert model.env is rewards_only
     make(planner_kwargs={"extra_state_probability": 0.5})  # trained for later use
+
+
+def test_a_plan_begins_with_the_answer_and_goes_on_as_the_chosen_candidate(trained):
+    obs = observe()
+    plans = trained.predict_plan(obs, deterministic=True)
+    assert plans.shape == (7, 3, 1) and np.all(np.abs(plans) <= 2)
+    np.testing.assert_array_equal(plans[:, 0], answer(trained, obs))
+    for row, planned in zip(rows_of(obs), plans, strict=True):
+        d = int(row["delay"][0])
+        tensors = {key: th.as_tensor(value)[None] for key, value in row.items()}
+        plan = trained.policy._plan(tensors, repeats=True)
+        best = int(plan.values.argmax())
+        assert plan.actions.shape[1] == 4
+        np.testing.assert_allclose(planned, 2 * plan.actions[0, best, d : d + 3].numpy(), rtol=1e-6)
+    set_random_seed(0)
+    first = trained.predict_plan(obs)
+    assert not np.array_equal(first, trained.predict_plan(obs))  # drawn anew
+    with trained.policy.answering("expert"):
+        np.testing.assert_array_equal(trained.predict_plan(obs, deterministic=True)[:, 0], answer(trained, obs))
+
+
+def test_a_plan_of_weighed_candidates_is_their_mean_throughout(trained):
+    before = trained.planner_kwargs["choice_factor"]
+    try:
+        trained.set_planner(choice_factor=1e-6)  # all alike
+        obs = {key: value[2:3] for key, value in observe().items()}
+        plan = trained.policy._plan({key: th.as_tensor(value) for key, value in obs.items()}, repeats=True)
+        mean = 2 * plan.actions[0, :, 2:5].mean(0).numpy()
+        np.testing.assert_allclose(trained.predict_plan(obs, deterministic=True)[0], mean, rtol=1e-4, atol=1e-5)
+    finally:
+        trained.set_planner(choice_factor=before)
+
+
+def test_a_plan_that_is_not_finite_is_refused(trained, monkeypatch):
+    monkeypatch.setattr(trained.policy, "unscale_action", lambda actions: actions * np.nan)
+    with pytest.raises(ValueError, match="The action is not finite"):
+        trained.predict_plan(observe(), deterministic=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from small_run import ENV, TINY_PLANNER, write_run
 
 from sb3_said import SAID, DelayedObservationWrapper
 from sb3_said.evaluation import rollout
-from sb3_said.zoo import enjoy, evaluate
+from sb3_said.zoo import enjoy, evaluate, latency
 from sb3_said.zoo.record import Record
 from sb3_said.zoo.runs import load_run
 
@@ -59,6 +60,49 @@ def test_evaluate_measures_the_planner_and_the_expert(
     assert plot.read_bytes()[:4] == b"\x89PNG" and titles == [f"said on {ENV}, delay 2"]
 
 
+@pytest.mark.parametrize(("period", "n"), [(1e6, 1), (1e-9, None)])
+def test_evaluate_in_real_time(
+    period: float, n: int | None, run: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Any answer takes one period of ten days, and more of a nanosecond than an episode has."""
+    file = tmp_path / "real.json"
+    evaluate.main([str(run), "--episodes", "1", "--latency-calls", "0", "--seed", "7", "--device", "cpu",
+                   "--realtime", "--period", str(period), "--json", str(file)])  # fmt: skip
+    document = json.loads(file.read_text())
+    labels = [f"{who}{how}" for who in ("planner", "expert") for how in ("", ", in real time", ", latency ignored")]
+    rows = {row["label"]: row for row in document["results"]}
+    assert list(rows) == labels and (document["delay"], document["period"]) == (0, period)
+    loaded = load_run(run, delay=0, device="cpu")
+    with loaded.model.policy.answering("planner"):
+        assert rows["planner"]["returns"] == loaded.play(1, seed=7).returns.tolist()  # answers for free
+    for label, counts in document["realtime"].items():
+        assert counts["steps"] == sum(rows[label]["lengths"])
+        if n is None:
+            assert counts["waiting_steps"] == counts["steps"] and "answer_steps_p50" not in counts
+        else:
+            assert (counts["answer_steps_p50"], counts["answer_steps_max"]) == (n, n)
+            assert (counts["waiting_steps"], counts["held_steps"], counts["late_answers"]) == (1, 0, 0)
+    if n == 1:  # the same as behind a wrapper whose actions take one step, and whose first one is 0
+        env = DelayedObservationWrapper(gym.make(ENV), 0, 1, max_delay=2)
+        with loaded.model.policy.answering("expert"):
+            obs, total, t, done = env.reset(seed=7)[0], 0.0, 0, False
+            while not done:
+                action = loaded.model.predict(obs, deterministic=True)[0] if t else np.zeros(1, np.float32)
+                obs, reward, terminated, truncated, _ = env.step(action)
+                total, t, done = total + float(reward), t + 1, terminated or truncated
+        assert rows["expert, in real time"]["returns"][0] == total
+    out = capsys.readouterr().out
+    assert "expert, latency ignored: " in out and "age_p99 0" in out
+
+
+def test_the_period_is_the_tasks_own_where_it_tells(run: Path) -> None:
+    loaded = load_run(run, device="cpu")
+    assert latency.control_period(loaded) == gym.make(ENV).unwrapped.dt  # type: ignore[attr-defined]
+    silent = replace(loaded, make_env=lambda: gym.make("MountainCarContinuous-v0"), info={"env": "MountainCar"})
+    with pytest.raises(ValueError, match="give --period"):
+        latency.control_period(silent)
+
+
 def test_a_shorter_delay_keeps_the_length_of_the_action_history(run: Path) -> None:
     loaded = load_run(run, delay=1, device="cpu")
     env = loaded.make_env()
@@ -84,6 +128,8 @@ def test_an_agent_without_its_run_folder(run: Path, tmp_path: Path) -> None:
         (["--env", "Hopper-v5"], "observation_space shapes"),
         (["--episodes", "0"], "at least 1"),
         (["--algo", "nonsense"], "give --algo"),
+        (["--period", "0.02"], "needs --realtime"),
+        (["--realtime", "--period", "0"], "above 0"),
     ],
 )
 def test_evaluate_says_what_is_wrong(

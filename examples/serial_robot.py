@@ -1,0 +1,44 @@
+"""A robot on a serial port: python serial_robot.py agent.zip /dev/ttyACM0 0.02
+
+The robot sends lines "N x1 x2 ...": the number of the command that it executed last, and its state. It gets lines
+"N a1 a2 ...", executes the newest at its next control step, and starts counting from 0 when the port is opened.
+"""
+
+import sys
+import threading
+from functools import partial
+
+import serial  # pip install pyserial
+
+from sb3_said import SAID
+from sb3_said.realtime import ControlLoop, ModelProcess, ticks
+
+
+def listen(port, loop):
+    for line in iter(port.readline, b""):  # readline returns nothing once the port is closed, or silent for a second
+        try:
+            number, *state = line.split()
+            loop.observe([float(x) for x in state], n_executed=int(number))
+        except ValueError as error:  # half a line, or a sensor that fails
+            print(f"Dropped {line!r}: {error}", file=sys.stderr)
+
+
+def send(port, number, action):
+    port.write(f"{number} {' '.join(f'{x:.6f}' for x in action)}\n".encode())
+
+
+def main(agent, device, period):
+    with ModelProcess(partial(SAID.load, agent, device="cpu")) as model, ControlLoop(model, period) as loop:
+        with serial.Serial(device, 115200, timeout=1) as port:
+            threading.Thread(target=listen, args=(port, loop), daemon=True).start()
+            try:
+                for now in ticks(period):
+                    action = loop.act(now)
+                    send(port, loop.n_sent, action)
+            finally:  # Ctrl-C, or no answer for too long
+                send(port, loop.n_sent + 1, loop.safe_action)
+                print(loop.statistics())
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], sys.argv[2], float(sys.argv[3]))

@@ -1,0 +1,63 @@
+"""How a loop asks a model: the observation that the wrapper would give, and as long a plan as the model has."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_said.delays.space import has_state_history
+from sb3_said.realtime.ledger import Request
+
+
+class Asking:
+    """Asks a model.
+
+    :param model: as of :class:`~sb3_said.realtime.ControlLoop`, as are the others
+    :param max_delay: D, that it was built for
+    """
+
+    def __init__(self, model: Any, max_delay: int, deterministic: bool, normalize: Callable[[Any], Any] | None):
+        self.model, self.max_delay, self.deterministic, self.normalize = model, max_delay, deterministic, normalize
+
+    def answer(self, request: Request) -> tuple[np.ndarray, float]:
+        """Return the actions from the request's target on, (K, act_dim), and the seconds that the model took.
+
+        Actions are in the units of the action space. K is 1 for a model without ``predict_plan``.
+        """
+        began = time.perf_counter()
+        observation: Any = request.observation[None]
+        if isinstance(self.model.observation_space, spaces.Dict):
+            observation = {
+                "observation": observation,
+                "action_history": request.history[None],
+                "delay": np.array([[request.age]], np.float32),
+            }
+            if has_state_history(self.model.observation_space):  # none is known that is younger, and no other is read
+                shape = (1, self.max_delay)
+                observation["state_history"] = np.zeros((*shape, *request.observation.shape), np.float32)
+                observation["state_known"] = np.zeros(shape, np.float32)
+        observation = observation if self.normalize is None else self.normalize(observation)
+        return plan_of(self.model, observation, self.deterministic)[0], time.perf_counter() - began
+
+    def warm_up(self) -> float:
+        """Run dummy answers until one takes no longer than later ones, and return the seconds that it took."""
+        space = self.model.observation_space
+        state_shape = (space["observation"] if isinstance(space, spaces.Dict) else space).shape or ()
+        history = np.zeros((self.max_delay, *self.model.action_space.shape), np.float32)
+        dummy = Request(-1, 0, 0, np.zeros(state_shape, np.float32), history, self.max_delay)
+        if hasattr(self.model, "warmup"):
+            self.model.warmup()
+        else:
+            self.answer(dummy)
+        return self.answer(dummy)[1]
+
+
+def plan_of(model: Any, observation: Any, deterministic: bool) -> np.ndarray:
+    """Return a plan for each observation of a batch: (B, K, act_dim), of one action where a model does not plan."""
+    if hasattr(model, "predict_plan"):
+        return np.asarray(model.predict_plan(observation, deterministic=deterministic))
+    return np.asarray(model.predict(observation, deterministic=deterministic)[0])[:, None]

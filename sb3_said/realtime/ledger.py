@@ -1,0 +1,188 @@
+"""A loop's memory, without clock or thread: what was sent, seen and planned, by the number of actions.
+
+Actions are numbered from 0 in every episode; action k leads from state k to state k + 1.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator
+from itertools import takewhile
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_said.delays.space import scale_action
+
+
+class NoAnswer(RuntimeError):
+    """No action was planned for longer than holding and the safe action may bridge."""
+
+
+class Request(NamedTuple):
+    """What a model is asked, and for which action."""
+
+    episode: int
+    n_sent: int
+    """actions sent when it is asked"""
+    target: int
+    """number of the action that it is asked for"""
+    observation: np.ndarray
+    """(obs_dim,) float32, the newest"""
+    history: np.ndarray
+    """(D, act_dim) float32, the actions before the target, those that will be sent meanwhile included"""
+    age: int
+    """how many of these do not show in the observation"""
+
+
+class Step(NamedTuple):
+    """What a step sends."""
+
+    action: np.ndarray
+    """(act_dim,), in the units of the action space"""
+    n_missing: int
+    """steps in a row for which no action was planned, this one included; 0 where one was"""
+
+
+class Ledger:
+    """Keeps the books of one episode at a time.
+
+    :param state_space: (obs_dim,)
+    :param action_space: (act_dim,)
+    :param max_delay: D, largest age that the model reads
+    :param max_age: largest age of an observation to act on
+    :param action_delay: from sending an action to its effect, in the unit of the stamps
+    :param hold_steps: steps in a row to repeat the last action
+    :param safe_action: (act_dim,), sent after that, and at first
+    """
+
+    def __init__(
+        self,
+        state_space: spaces.Box,
+        action_space: spaces.Box,
+        max_delay: int,
+        max_age: int,
+        action_delay: float,
+        hold_steps: float,
+        safe_action: np.ndarray,
+    ):
+        self.state_space, self.action_space = state_space, action_space
+        self.max_delay, self.max_age, self.action_delay = max_delay, max_age, action_delay
+        self.hold_steps, self.safe_action = hold_steps, safe_action
+        self.episode = -1
+        self.start_episode(-math.inf)
+
+    def start_episode(self, began: float) -> None:
+        """Forget all; observations captured before ``began`` are of another episode."""
+        self.episode += 1
+        self.n_sent = self.n_missing = 0
+        self.is_answered = False
+        self.observation: np.ndarray | None = None
+        self.captured, self._n_shown = began, 0
+        self._last = self.safe_action
+        self._planned: dict[int, np.ndarray] = {}
+        self._history = np.zeros((self.max_delay, *self.safe_action.shape), np.float32)
+        self._effects: deque[float] = deque(maxlen=self.max_delay + 1)  # when the newest actions took effect
+
+    @property
+    def age(self) -> int:
+        """How many of the newest actions do not show in the newest observation."""
+        return self.n_sent - self._n_shown
+
+    def observe(self, observation: Any, capture_time: float | None, n_executed: int | None) -> bool:
+        """Take an observation, and tell whether it is younger than the one at hand.
+
+        :param observation: (obs_dim,)
+        :param capture_time: when it was captured; None if unknown
+        :param n_executed: how many actions were executed before it was captured; by default those that took effect
+            before ``capture_time``
+        :raises ValueError: for what is no state, or for more actions than were sent
+        """
+        state = np.array(observation, np.float32)
+        if state.shape != self.state_space.shape or not np.isfinite(state).all():
+            raise ValueError(
+                f"The observation has the shape {state.shape} and entries {state}, expected finite numbers of the "
+                f"shape {self.state_space.shape}; drop the reading where a sensor fails."
+            )
+        if capture_time is not None and not math.isfinite(capture_time):
+            raise ValueError(f"capture_time is {capture_time}, expected a time; leave it out if it is not known.")
+        if n_executed is not None and not 0 <= n_executed <= self.n_sent:
+            raise ValueError(
+                f"The observation says that {n_executed} actions were executed, but {self.n_sent} were sent since "
+                "reset(); reset the robot's count, too, and drop observations of the episode before."
+            )
+        if n_executed is None:  # counted in the newest D + 1; an older observation is out of reach anyhow
+            later = takewhile(lambda effect: effect >= capture_time, reversed(self._effects))  # type: ignore[operator]
+            n_executed = self.n_sent - sum(1 for _ in later)
+        is_first = self.observation is None
+        if capture_time is not None:
+            if capture_time < self.captured or (capture_time == self.captured and not is_first):
+                return False
+            self.captured = capture_time
+        elif n_executed < self._n_shown:
+            return False
+        self.observation, self._n_shown = state, n_executed
+        return True
+
+    def request(self, n_steps: int) -> Request | None:
+        """Return what to ask for the action to send in ``n_steps`` steps; None where no observation is young enough.
+
+        If the model does not read ages that large, it is asked for an earlier action.
+        """
+        if self.observation is None or self.age > self.max_age:
+            return None
+        n_steps = min(n_steps, self.max_delay - self.age)
+        history = self._history
+        if n_steps > 0:
+            coming = np.stack([step.action for step in self._coming(n_steps)])
+            scaled = scale_action(coming, self.action_space).astype(np.float32)
+            history = np.concatenate([history, scaled])[-self.max_delay :]
+        target = self.n_sent + n_steps
+        return Request(self.episode, self.n_sent, target, self.observation, history.copy(), self.age + n_steps)
+
+    def splice(self, actions: np.ndarray, target: int) -> int:
+        """Plan actions from a number on, in place of what was planned there.
+
+        :param actions: (K, act_dim), in the units of the action space
+        :param target: number of the first of them
+        :return: how many of them come too late
+        """
+        self.is_answered = True
+        self._planned = {number: action for number, action in self._planned.items() if number < target}
+        self._planned |= {target + k: action for k, action in enumerate(actions) if target + k >= self.n_sent}
+        n_late = max(self.n_sent - target, 0)
+        if n_late >= len(actions):  # still newer than what was sent last
+            self._last, self.n_missing = actions[-1], n_late - len(actions)
+        return n_late
+
+    def is_planned(self, number: int) -> bool:
+        """Tell whether an answer covers an action."""
+        return number in self._planned
+
+    def next_step(self) -> Step:
+        """Return what to send next. An observation that is too old discards what is planned."""
+        if self.observation is not None and self.age > self.max_age:
+            self._planned.clear()
+        return next(self._coming(1))
+
+    def send(self, step: Step, now: float) -> None:
+        """Note what was sent at a time."""
+        self._planned.pop(self.n_sent, None)
+        self._last, self.n_missing = step
+        self._history = np.concatenate([self._history, scale_action(step.action, self.action_space)[None]], axis=0)
+        self._history = self._history[1:].astype(np.float32)
+        self._effects.append(now + self.action_delay)
+        self.n_sent += 1
+
+    def _coming(self, n_steps: int) -> Iterator[Step]:
+        """Yield what the next steps will send, unless another answer or a too old observation comes between."""
+        action, n_missing = self._last, self.n_missing
+        for number in range(self.n_sent, self.n_sent + n_steps):
+            if number in self._planned:
+                action, n_missing = self._planned[number], 0
+            else:
+                n_missing += 1
+                action = self.safe_action if n_missing > self.hold_steps else action
+            yield Step(action, n_missing)

@@ -1,0 +1,320 @@
+"""A control loop that counts its own time: sensors deliver when they do, answers take their time, both are delay."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from copy import deepcopy
+from typing import Any
+
+import numpy as np
+
+from sb3_said.delays.space import check_spaces, unscale_action
+from sb3_said.realtime.asking import Asking
+from sb3_said.realtime.ledger import Ledger, NoAnswer, Request
+from sb3_said.realtime.statistics import LoopStatistics, percentile
+
+#: Newest answers that tell how many steps the next one will take, and the share of them that this covers.
+ANSWERS_REMEMBERED, ANSWERS_COVERED = 100, 0.95
+#: A stamp this many periods ahead of ``now`` was read from another clock.
+FAR_AHEAD = 1000
+
+
+class ControlLoop:
+    """Runs a model against a robot: observations come in from any thread, an action goes out every period.
+
+    :meth:`act` never blocks. A worker thread asks the model whenever an observation arrives, and once a period if none
+    does. An observation of age a, with an answer expected n steps later, is planned at the age a + n, with the n
+    actions that will be sent meanwhile already in its history. When an answer is due is counted in actions sent, never
+    timed: it begins at the action that it was planned for. If that one has been sent already, the plan's later actions
+    serve. A model plans later actions if it has ``predict_plan``, as :class:`~sb3_said.SAID` does; of any other, an
+    answer is one action.
+
+    Where no action is planned, the last one is held for ``hold_steps``, then ``safe_action`` is sent for
+    ``safe_steps``, then ``act`` raises :class:`NoAnswer`. An observation older than ``max_age`` discards what is
+    planned. Until an episode's first answer the safe action is sent.
+
+    Python runs one thread at a time. Where ``act`` must not wait for the few milliseconds that a model computes in
+    Python, give the model a process of its own: :class:`~sb3_said.realtime.ModelProcess`.
+
+    :param model: anything with ``predict``, ``observation_space`` and ``action_space`` of Stable-Baselines3
+    :param period: of ``act``, in the unit of ``now``: seconds by default
+    :param answer_steps: n, steps that an answer will take; by default what 95 % of the newest 100 took
+    :param action_delay: from ``act`` to the moment that the action takes effect, in the unit of ``now``
+    :param max_age: largest age of an observation to act on, in steps; the model's largest delay by default
+    :param hold_steps: steps in a row to repeat the last action, >= 0; None for no limit
+    :param safe_action: (act_dim,), in the units of the action space; the middle of its bounds by default
+    :param safe_steps: steps in a row to send it, >= 0; None for no limit
+    :param deterministic: handed to the model
+    :param normalize: applied to batched observations before the model, such as ``VecNormalize.normalize_obs``
+    :param count_latency: False for a loop that ignores how long answers take, to compare with: it plans for the step at
+        which it asks, and sends one action when the answer arrives
+    :param simulate: makes the loop deterministic, without a thread. The model is asked inside ``act``, whenever it is
+        not busy, and is busy for ``simulate(seconds)`` steps, where ``seconds`` is what it took: ``lambda seconds: 0``
+        gives answers for free
+    :raises ValueError: for a model or a setting that does not fit
+
+    >>> loop = ControlLoop(model, period=0.02)  # doctest: +SKIP
+    >>> loop.reset()  # doctest: +SKIP
+    >>> loop.observe(observation, capture_time)  # from any thread  # doctest: +SKIP
+    >>> action = loop.act()  # every 20 ms  # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        period: float,
+        *,
+        answer_steps: int | None = None,
+        action_delay: float = 0.0,
+        max_age: int | None = None,
+        hold_steps: int | None = 5,
+        safe_action: Any = None,
+        safe_steps: int | None = None,
+        deterministic: bool = True,
+        normalize: Callable[[Any], Any] | None = None,
+        count_latency: bool = True,
+        simulate: Callable[[float], int] | None = None,
+    ):
+        state_space, max_delay = check_spaces(model.observation_space, model.action_space)
+        self._asking = Asking(model, max_delay, deterministic, normalize)
+        if not (period > 0 and action_delay >= 0):
+            raise ValueError(f"period is {period} and action_delay {action_delay}, expected above 0 and at least 0.")
+        counts = {"answer_steps": answer_steps, "max_age": max_age, "hold_steps": hold_steps, "safe_steps": safe_steps}
+        if negative := {name: n for name, n in counts.items() if n is not None and n < 0}:
+            raise ValueError(f"Steps are counted from 0 on, got {negative}.")
+        if max_age is not None and max_age > max_delay:
+            raise ValueError(
+                f"max_age is {max_age}, but the model reads ages 0..{max_delay}; train it with a larger max_delay."
+            )
+        space, middle = model.action_space, unscale_action(np.zeros(model.action_space.shape), model.action_space)
+        safe = middle if safe_action is None else np.array(safe_action, space.dtype)
+        if not space.contains(safe):
+            raise ValueError(f"safe_action is {safe_action}, expected an action of {space}.")
+        self.period, self.count_latency, self._simulate = period, count_latency, simulate
+        self._max_missing = math.inf if hold_steps is None or safe_steps is None else hold_steps + safe_steps
+        #: n, steps that the next answer is expected to take.
+        self.answer_steps = answer_steps or 0
+        self._answer_steps_given = answer_steps is not None
+        self._took: deque[int] = deque(maxlen=ANSWERS_REMEMBERED)
+
+        # All that follows is read and written under this lock. Nobody holds it while a model computes, but for a
+        # simulation.
+        self._changed = threading.Condition(threading.Lock())
+        hold = math.inf if hold_steps is None else hold_steps
+        max_age = max_delay if max_age is None else max_age
+        self._ledger = Ledger(state_space, space, max_delay, max_age, action_delay, hold, safe)
+        self._statistics = LoopStatistics()
+        self._acted = math.nan  # when
+        self._is_due = self._has_heard = self._is_closing = False  # to ask; an observation since the last act
+        self._is_busy, self._stands = simulate is None, False  # and the next answer is waited for
+        self._error: BaseException | None = None
+        self._in_flight: tuple[Request, np.ndarray, int] | None = None  # of a simulation, and when it arrives
+        if simulate is not None:
+            self._warm_up()
+            return
+        self._worker = threading.Thread(target=self._work, name="ControlLoop", daemon=True)
+        self._worker.start()
+        self.wait()
+
+    def __enter__(self) -> ControlLoop:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def n_sent(self) -> int:
+        """Actions sent in this episode; with ``n_executed``, the number to send along with the newest."""
+        return self._ledger.n_sent
+
+    @property
+    def safe_action(self) -> np.ndarray:
+        """What is sent where nothing better is known: (act_dim,), in the units of the action space."""
+        return self._ledger.safe_action.copy()
+
+    def statistics(self) -> LoopStatistics:
+        """Return a copy of what was counted so far."""
+        with self._changed:
+            return deepcopy(self._statistics)
+
+    def reset(self, now: float | None = None) -> None:
+        """Begin an episode: nothing has been sent, seen or planned.
+
+        :param now: observations captured before are of another episode, and are dropped; by default none is
+        """
+        with self._changed:
+            self._ledger.start_episode(-math.inf if now is None else now)
+            self._is_due = self._has_heard = self._stands = False
+            self._in_flight, self._acted = None, math.nan
+
+    def observe(self, observation: Any, capture_time: float | None = None, n_executed: int | None = None) -> None:
+        """Take an observation, from any thread; one that is no younger than the one at hand is dropped.
+
+        Its age is the number of the newest actions that do not show in it: those that took effect at its capture or
+        later. Stamps and ``now`` must be of one clock.
+
+        :param observation: (obs_dim,), in the units of the task; copied
+        :param capture_time: when it was captured. The same stamp twice is a sensor that froze: its observation ages. By
+            default ``time.monotonic()``, unless ``n_executed`` is given
+        :param n_executed: number of the action that was executed last before the capture, 0 before the first. It
+            counts better than a stamp, since no command's time on its way has to be known
+        :raises ValueError: for what is no finite observation, or for more actions than were sent
+        """
+        if capture_time is None and n_executed is None:
+            capture_time = time.monotonic()
+        with self._changed:
+            if self._ledger.observe(observation, capture_time, n_executed):
+                self._has_heard = self._is_due = True
+                self._changed.notify_all()
+            else:
+                self._statistics.stale_observations += 1
+
+    def act(self, now: float | None = None) -> np.ndarray:
+        """Return the action to send now, and count it as sent.
+
+        :param now: ``time.monotonic()`` by default; or a count of steps, which makes a simulation independent of clocks
+        :return: (act_dim,), in the units of the action space
+        :raises NoAnswer: where no action has been planned for too long; nothing counts as sent
+        :raises RuntimeError: where the model has failed, or the loop is closed
+        :raises ValueError: where stamps and ``now`` are of different clocks
+        """
+        now = time.monotonic() if now is None else now
+        with self._changed:
+            self._check()
+            if self._ledger.captured - now > FAR_AHEAD * self.period:
+                raise ValueError(
+                    f"An observation was captured at {self._ledger.captured}, but now it is {now}; take both from one "
+                    "clock, and the period in its unit."
+                )
+            if self._simulate is not None:
+                self._pretend(self._simulate)
+            step = self._ledger.next_step()
+            if step.n_missing > self._max_missing:
+                raise NoAnswer(f"No action was planned for {step.n_missing} steps. Counted so far: {self._statistics}")
+            self._count(step.n_missing, now)
+            self._ledger.send(step, now)
+            if not self._has_heard:  # ask again: the same observation is a step older
+                self._is_due = True
+                self._changed.notify_all()
+            self._has_heard, self._stands, self._acted = False, False, now
+            return step.action.copy()
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Block until the model is idle, and tell whether it is.
+
+        Before the first action of an episode the robot stands, so that no action is sent meanwhile: then the answer
+        that this waits for begins with that one.
+
+        :param timeout: in seconds; None for no limit
+        :raises RuntimeError: where the model has failed, or the loop is closed
+        """
+        with self._changed:
+            idle = self._idle(timeout)
+            if idle and self._simulate is None and self.n_sent == 0 and not self._ledger.is_planned(0):
+                self._stands = self._is_due = True
+                self._changed.notify_all()
+                idle = self._idle(timeout)
+            return idle
+
+    def close(self) -> None:
+        """Stop the worker, once it has made the answer that it is making."""
+        with self._changed:
+            self._is_closing = True
+            self._changed.notify_all()
+        if self._simulate is None and self._worker is not threading.current_thread():
+            self._worker.join()
+
+    def _idle(self, timeout: float | None) -> bool:
+        def is_over() -> bool:
+            has_stopped = self._is_closing or self._error is not None
+            return has_stopped or self._simulate is not None or not (self._is_busy or self._is_due)
+
+        idle = self._changed.wait_for(is_over, timeout)
+        self._check()
+        return idle
+
+    def _next_request(self) -> Request | None:
+        return self._ledger.request(self.answer_steps if self.count_latency and not self._stands else 0)
+
+    def _check(self) -> None:
+        if self._error is not None:
+            raise RuntimeError(f"The model failed: {self._error}") from self._error
+        if self._is_closing:
+            raise RuntimeError("The loop is closed; make another one.")
+
+    def _count(self, n_missing: int, now: float) -> None:
+        ledger, counted = self._ledger, self._statistics
+        counted.steps += 1
+        if ledger.observation is not None:
+            counted.ages[ledger.age] += 1
+        if n_missing > 0:
+            kind = "held" if n_missing <= ledger.hold_steps else "safe"
+            name = f"{kind if ledger.is_answered else 'waiting'}_steps"
+            setattr(counted, name, getattr(counted, name) + 1)
+        if ledger.n_sent > 0:
+            gap = (now - self._acted) / self.period
+            counted.gaps[round(gap, 3)] += 1
+            counted.overruns += gap > 1.5
+
+    def _work(self) -> None:
+        """Answer until closed: the worker's thread."""
+        try:
+            self._warm_up()
+            while True:
+                with self._changed:
+                    self._is_busy = False
+                    self._changed.notify_all()
+                    self._changed.wait_for(lambda: self._is_closing or self._is_due)
+                    if self._is_closing:
+                        return
+                    request, self._is_due, self._stands = self._next_request(), False, False
+                    self._is_busy = True
+                if request is not None:
+                    actions, _ = self._asking.answer(request)
+                    with self._changed:
+                        self._take(request, actions)
+        except BaseException as error:  # act raises it where the robot is
+            with self._changed:
+                self._error, self._is_busy = error, False
+                self._changed.notify_all()
+
+    def _pretend(self, busy_steps: Callable[[float], int]) -> None:
+        """Be a worker that is busy for some steps, at the moment before an action is sent."""
+        for may_ask in (True, False):
+            if self._in_flight is not None and self._in_flight[2] <= self.n_sent:
+                request, actions, _ = self._in_flight
+                self._in_flight = None
+                self._take(request, actions)
+            if may_ask and self._in_flight is None:
+                asked = self._next_request()
+                if asked is not None:
+                    actions, seconds = self._asking.answer(asked)
+                    self._in_flight = asked, actions, self.n_sent + busy_steps(seconds)
+
+    def _take(self, request: Request, actions: np.ndarray) -> None:
+        """Splice an answer in, unless it is of an episode that has ended."""
+        ledger = self._ledger
+        if request.episode != ledger.episode:
+            return
+        took = ledger.n_sent - request.n_sent
+        self._statistics.answer_steps[took] += 1
+        self._took.append(took)
+        self._expect()
+        if self.count_latency:
+            self._statistics.late_answers += ledger.splice(actions, request.target) > 0
+        else:
+            ledger.splice(actions[:1], ledger.n_sent)
+
+    def _expect(self) -> None:
+        if not self._answer_steps_given:
+            self.answer_steps = int(percentile(Counter(self._took), ANSWERS_COVERED))
+
+    def _warm_up(self) -> None:
+        """Make the first answer take no longer than later ones, and expect it to take as long."""
+        seconds = self._asking.warm_up()
+        self._took.append(math.ceil(seconds / self.period) if self._simulate is None else self._simulate(seconds))
+        self._expect()

@@ -1,0 +1,46 @@
+"""An exported student on a computer without PyTorch."""
+
+from __future__ import annotations
+
+import json
+import os
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_said.delays.space import delayed_space
+
+
+class OnnxModel:
+    """Answers with a file of ``sb3-said export``, for a :class:`~sb3_said.realtime.ControlLoop`; on one thread.
+
+    :param path: of the file
+    :raises ImportError: without the package onnxruntime
+    """
+
+    def __init__(self, path: str | os.PathLike[str]):
+        try:
+            import onnxruntime
+        except ImportError as error:
+            raise ImportError("onnxruntime is missing, which OnnxModel needs: pip install onnxruntime") from error
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        self._session = onnxruntime.InferenceSession(os.fspath(path), options, providers=["CPUExecutionProvider"])
+        self._keys = [each.name for each in self._session.get_inputs()]
+        properties = self._session.get_modelmeta().custom_metadata_map
+        low, high = (np.array(json.loads(properties[name]), np.float32) for name in ("action_low", "action_high"))
+        self.action_space = spaces.Box(low, high)
+        state_space = spaces.Box(-np.inf, np.inf, (self._session.get_inputs()[0].shape[1],), np.float32)
+        self.observation_space: spaces.Space[Any] = state_space
+        if "delay" in self._keys:
+            self.observation_space = delayed_space(state_space, self.action_space, int(properties["max_delay"]))
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[np.ndarray, None]:
+        """Answer a batch (B, ...) with actions (B, act_dim), in the units of the action space."""
+        parts = observation if isinstance(observation, dict) else {"observation": observation}
+        given = {key: np.asarray(parts[key], np.float32) for key in self._keys}
+        action: np.ndarray = self._session.run(["action"], given)[0]
+        return action, None

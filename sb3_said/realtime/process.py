@@ -1,0 +1,104 @@
+"""A model in a process of its own, so that what it computes in Python never makes a control loop wait."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+
+from sb3_said.realtime.asking import plan_of
+
+
+class ModelProcess:
+    """Loads a model in another process and answers as it does, for a :class:`~sb3_said.realtime.ControlLoop`.
+
+    :param load: makes the model; a function that another process can import, such as
+        ``functools.partial(SAID.load, "agent.zip", device="cpu")``
+    :raises RuntimeError: where the model cannot be loaded; the message holds the reason
+
+    >>> with ModelProcess(partial(SAID.load, "agent.zip")) as model, ControlLoop(model, 0.02) as loop:  # doctest: +SKIP
+    ...     ...
+    """
+
+    def __init__(self, load: Callable[[], Any]):
+        context = multiprocessing.get_context("spawn")  # a fork would copy locks that other threads hold
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(target=_serve, args=(load, theirs), name="ModelProcess", daemon=True)
+        self._process.start()
+        theirs.close()
+        self.observation_space, self.action_space = self._receive()
+
+    def __enter__(self) -> ModelProcess:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def warmup(self) -> None:
+        """Warm the model up, where it can be."""
+        self._call("warmup")
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, None]:
+        """Answer a batch (B, ...) with actions (B, act_dim), as Stable-Baselines3 does for models without a memory."""
+        return self.predict_plan(observation, deterministic)[:, 0], None
+
+    def predict_plan(self, observation: Any, deterministic: bool = False) -> np.ndarray:
+        """Answer a batch (B, ...) with plans (B, K, act_dim); K is 1 for a model that does not plan."""
+        plan: np.ndarray = self._call("plan", observation, deterministic)
+        return plan
+
+    def close(self) -> None:
+        """End the process. Close the loop first, which may be waiting for an answer."""
+        self._pipe.close()
+        self._process.join(5)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+
+    def _call(self, *question: Any) -> Any:
+        try:
+            self._pipe.send(question)
+        except OSError as error:
+            raise RuntimeError("The model's process has ended; make another one.") from error
+        return self._receive()
+
+    def _receive(self) -> Any:
+        try:
+            answer, failure = self._pipe.recv()
+        except (EOFError, OSError) as error:
+            self._process.join(5)
+            raise RuntimeError(f"The model's process has ended with exit code {self._process.exitcode}.") from error
+        if failure is not None:
+            raise RuntimeError(f"In the model's process: {failure}")
+        return answer
+
+
+def _serve(load: Callable[[], Any], pipe: Connection) -> None:
+    """Answer until the other end is closed. Ctrl-C is for the loop, which may still want an answer."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        model = load()
+        pipe.send(((model.observation_space, model.action_space), None))
+    except Exception as error:  # told to who asked
+        pipe.send((None, f"{type(error).__name__}: {error}"))
+        return
+    while True:
+        try:
+            kind, *arguments = pipe.recv()
+        except EOFError:
+            return
+        answer, failure = None, None
+        try:
+            if kind == "plan":
+                answer = plan_of(model, *arguments)
+            elif hasattr(model, "warmup"):
+                model.warmup()
+        except Exception as error:
+            failure = f"{type(error).__name__}: {error}"
+        pipe.send((answer, failure))

@@ -1,0 +1,82 @@
+"""What a control loop counts: how old observations were, how late answers, and how often it went without."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any
+
+#: What is reported of each distribution; the last is the maximum.
+PERCENTILES = {"p50": 0.50, "p95": 0.95, "p99": 0.99, "max": 1.0}
+
+
+def percentile(counts: Counter[Any], share: float) -> float:
+    """Return the smallest value that at least a share of all are not above (nearest rank).
+
+    :param counts: how often each value was met, at least one
+    :param share: in (0, 1]
+
+    >>> percentile(Counter([1, 1, 1, 9]), 0.75), percentile(Counter([1, 1, 1, 9]), 0.76)
+    (1.0, 9.0)
+    """
+    reached, needed = 0, share * counts.total()
+    for value in sorted(counts):
+        reached += counts[value]
+        if reached >= needed - 1e-9:
+            return float(value)
+    raise ValueError("A percentile needs at least one value, got none; let the loop act first.")
+
+
+@dataclass
+class LoopStatistics:
+    """Counts of a :class:`~sb3_said.realtime.ControlLoop`, over all episodes since it was made. Memory is bounded."""
+
+    ages: Counter[int] = field(default_factory=Counter)
+    """of the newest observation when an action was sent, in control steps"""
+    answer_steps: Counter[int] = field(default_factory=Counter)
+    """actions that were sent while an answer was made"""
+    gaps: Counter[float] = field(default_factory=Counter)
+    """from one action to the next, in periods, to a thousandth"""
+    steps: int = 0
+    """actions sent"""
+    overruns: int = 0
+    """actions sent more than half a period late"""
+    waiting_steps: int = 0
+    """safe actions sent before an episode's first answer"""
+    held_steps: int = 0
+    """actions repeated, since none was planned for the step"""
+    safe_steps: int = 0
+    """safe actions sent, since holding had lasted too long"""
+    late_answers: int = 0
+    """answers after the step that they were planned for; a plan's later actions serve"""
+    stale_observations: int = 0
+    """observations that were no younger than the one at hand: repeated by a frozen sensor, or overtaken"""
+
+    def to_dict(self) -> dict[str, float]:
+        """Return the counts, and percentiles of what was met, such as ``age_p95``, in JSON types."""
+        found: dict[str, float] = {}
+        for name, counts in (("age", self.ages), ("answer_steps", self.answer_steps), ("gap", self.gaps)):
+            if counts:
+                found |= {f"{name}_{key}": percentile(counts, share) for key, share in PERCENTILES.items()}
+        return found | {name: value for name, value in vars(self).items() if isinstance(value, int)}
+
+    def __str__(self) -> str:
+        """Return one line for a log."""
+        found = self.to_dict()
+
+        def spread(name: str) -> str:
+            return "/".join(f"{found[f'{name}_{key}']:g}" if f"{name}_{key}" in found else "-" for key in PERCENTILES)
+
+        return (
+            f"steps {self.steps}, p50/p95/p99/max: age {spread('age')}, answer {spread('answer_steps')} steps, "
+            f"gap {spread('gap')} periods; overruns {self.overruns}, held {self.held_steps}, safe {self.safe_steps}, "
+            f"waiting {self.waiting_steps}, late answers {self.late_answers}, stale {self.stale_observations}"
+        )
+
+    def record(self, logger: Any) -> None:
+        """Hand every number to a logger of Stable-Baselines3, as ``realtime/...``; ``logger.dump(step)`` writes them.
+
+        :param logger: such as ``configure("folder", ["tensorboard"])`` of ``stable_baselines3.common.logger``
+        """
+        for name, value in self.to_dict().items():
+            logger.record(f"realtime/{name}", value)

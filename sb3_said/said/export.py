@@ -1,0 +1,96 @@
+"""Write a student as an ONNX graph, for computers without PyTorch."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from torch import nn
+
+from sb3_said.delays.space import KEYS, check_spaces
+from sb3_said.files.atomic import replacing
+from sb3_said.said.policies import SAIDPolicy
+
+OPSET, IR_VERSION = 17, 8  # of 2022, so that old runtimes read it
+
+
+def to_onnx(policy: SAIDPolicy) -> Any:
+    """Return a policy's student as an ``onnx.ModelProto`` that answers as ``predict`` does.
+
+    Its inputs are the keys of a delayed observation, float32: ``observation`` (B, obs_dim), ``action_history``
+    (B, D, act_dim) and ``delay`` (B, 1); ``observation`` alone where the agent's task has no delay. Its output is
+    ``action`` (B, act_dim), in the units of the action space. The metadata have ``max_delay``, and the bounds of
+    actions, which the history is scaled by.
+
+    :raises ImportError: without the package onnx
+    :raises ValueError: for a policy without a student
+    """
+    try:
+        import onnx
+        from onnx import TensorProto, helper, numpy_helper
+    except ImportError as error:
+        raise ImportError('onnx is missing, which export needs: pip install "sb3_said[export]"') from error
+    student, space = policy.student, policy.action_space
+    if student is None:
+        raise ValueError("This agent has no student to export; call distill() first, and save it.")
+    assert isinstance(space, spaces.Box)  # as check_spaces says
+    state_space, max_delay = check_spaces(policy.observation_space, space)
+    obs_dim, act_dim = state_space.shape[0], space.shape[0]
+    nodes: list[Any] = []
+    constants: list[Any] = []
+
+    def constant(value: Any, dtype: Any = np.float32) -> str:
+        name = f"constant_{len(constants)}"
+        constants.append(numpy_helper.from_array(np.asarray(value, dtype), name))
+        return name
+
+    def add(kind: str, inputs: Sequence[str], **attributes: Any) -> str:
+        name = f"{kind}_{len(nodes)}"
+        nodes.append(helper.make_node(kind, list(inputs), [name], **attributes))
+        return name
+
+    read = KEYS[0]
+    if student.reader is not None:
+        steps_ago = constant(np.arange(max_delay, 0, -1))  # (D,)
+        since = add("Cast", [add("LessOrEqual", [steps_ago, KEYS[2]])], to=TensorProto.FLOAT)  # (B, D)
+        history = add("Mul", [KEYS[1], add("Unsqueeze", [since, constant([2], np.int64)])])
+        flat = add("Reshape", [history, constant([-1, max_delay * act_dim], np.int64)])
+        age = add("Div", [KEYS[2], constant(max(max_delay, 1))])
+        read = add("Concat", [KEYS[0], flat, age], axis=1)
+    x = add("Div", [add("Sub", [read, constant(student.mean.cpu())]), constant(student.std.cpu())])
+    for layer in student.network:
+        if isinstance(layer, nn.Linear):
+            weights = [constant(part.detach().cpu()) for part in (layer.weight, layer.bias)]
+            x = add("Gemm", [x, *weights], transB=1)
+        else:
+            x = add({nn.ReLU: "Relu", nn.Tanh: "Tanh"}[type(layer)], [x])
+    low, high = (bound.astype(np.float32) for bound in (space.low, space.high))
+    x = add("Add", [constant(low), add("Mul", [constant(0.5 * (high - low)), add("Add", [x, constant(1.0)])])])
+    x = add("Max", [add("Min", [x, constant(high)]), constant(low)])
+    nodes.append(helper.make_node("Identity", [x], ["action"]))
+
+    shapes = {"observation": ["B", obs_dim], "action_history": ["B", max_delay, act_dim], "delay": ["B", 1]}
+    given = KEYS if student.reader is not None else KEYS[:1]
+    inputs = [helper.make_tensor_value_info(key, TensorProto.FLOAT, shapes[key]) for key in given]
+    outputs = [helper.make_tensor_value_info("action", TensorProto.FLOAT, ["B", act_dim])]
+    graph = helper.make_graph(nodes, "student", inputs, outputs, constants)
+    made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
+    bounds = {"action_low": json.dumps(low.tolist()), "action_high": json.dumps(high.tolist())}
+    helper.set_model_props(made, {"max_delay": str(max_delay), **bounds})
+    onnx.checker.check_model(made)
+    return made
+
+
+def export(policy: SAIDPolicy, path: str | os.PathLike[str]) -> None:
+    """Write :func:`to_onnx`'s graph to a file.
+
+    :raises ImportError: without the package onnx
+    :raises ValueError: for a policy without a student
+    """
+    made = to_onnx(policy)
+    with replacing(path) as file:
+        file.write(made.SerializeToString())

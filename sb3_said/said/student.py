@@ -1,0 +1,216 @@
+"""A student for small computers: a plain network that answers as the planner does, without denoising."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
+from torch.nn import functional as F
+
+from sb3_said.delays.space import KEYS, check_spaces
+from sb3_said.sac.extractors import StateAugmentedExtractor
+
+SAID = Any  # whose module imports this one
+HELD_OUT = 0.05  # of the replay's labels
+LABELLED_AT_ONCE = 512
+
+
+@dataclass(frozen=True)
+class Distillation:
+    """How a student learns. The values are ours, found to suffice on small tasks."""
+
+    n_labels: int = 50_000
+    """answers of the planner to observations from the replay, at ages drawn from all that it plans at"""
+    own_steps: int = 10_000
+    """and to those that the student visits itself (DAgger, Ross et al. 2011), over all rounds"""
+    rounds: int = 4
+    """of visiting and learning on, after the first learning"""
+    gradient_steps: int = 20_000
+    """updates, over all rounds"""
+    batch_size: int = 256
+    learning_rate: float = 1e-3
+    """of Adam; falls linearly to 0"""
+    q_weight: float = 0.0
+    """of -min Q(s_t, a) beside the squared error, in mean sizes of Q as in TD3+BC (Fujimoto and Gu 2021). For replay
+    alone, which knows the true state s_t"""
+
+    def __post_init__(self) -> None:
+        counts = {name: getattr(self, name) for name in ("n_labels", "gradient_steps", "batch_size")}
+        if min(counts.values()) < 1 or self.own_steps < 0 or self.rounds < 0:
+            raise ValueError(f"Expected {', '.join(counts)} of at least 1, own_steps and rounds of at least 0: {self}")
+        if not (self.learning_rate > 0 and self.q_weight >= 0):
+            raise ValueError(f"Expected a learning_rate above 0 and a q_weight of at least 0: {self}")
+
+
+class Student(nn.Module):
+    """Reads [newest observation, actions since, age / D], z-scored, as the expert's actor does without the z-scores.
+
+    :param observation_space: of the agent
+    :param action_space: (act_dim,)
+    :param width: of the two hidden layers
+    :raises ValueError: for a width below 1
+    """
+
+    mean: th.Tensor
+    std: th.Tensor
+    preferred: th.Tensor
+
+    def __init__(self, observation_space: spaces.Space[Any], action_space: spaces.Box, width: int):
+        super().__init__()
+        if width < 1:
+            raise ValueError(f"student_width is {width}, expected at least 1.")
+        state_space, self.max_delay = check_spaces(observation_space, action_space)
+        self.width, self.reader = width, None
+        n_inputs, act_dim = state_space.shape[0], action_space.shape[0]
+        if isinstance(observation_space, spaces.Dict):
+            self.reader = StateAugmentedExtractor(observation_space)
+            n_inputs = self.reader.features_dim
+        self.register_buffer("mean", th.zeros(n_inputs))
+        self.register_buffer("std", th.ones(n_inputs))
+        self.register_buffer("preferred", th.zeros(()))  # 1: it answers
+        hidden = nn.Linear(n_inputs, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU()
+        self.network = nn.Sequential(*hidden, nn.Linear(width, act_dim), nn.Tanh())
+
+    def read(self, observation: PyTorchObs) -> th.Tensor:
+        """Return what it reads: (B, n_inputs)."""
+        if self.reader is None:
+            assert isinstance(observation, th.Tensor)
+            return observation
+        return self.reader(observation)
+
+    def answer(self, inputs: th.Tensor) -> th.Tensor:
+        """Return actions in [-1, 1] for what it has read: (B, act_dim)."""
+        return self.network((inputs - self.mean) / self.std)
+
+    def forward(self, observation: PyTorchObs) -> th.Tensor:
+        return self.answer(self.read(observation))
+
+    @th.no_grad()
+    def fit(self, inputs: th.Tensor) -> None:
+        """Take over how its inputs (M, n_inputs) are spread."""
+        std, mean = th.std_mean(inputs, dim=0, correction=0)
+        self.mean.copy_(mean)
+        self.std.copy_(th.where(std > 1e-6, std, 1.0))
+
+
+@dataclass
+class _Rows:
+    """What a student learns from."""
+
+    inputs: th.Tensor  # (M, n_inputs)
+    labels: th.Tensor  # (M, act_dim)
+    presents: th.Tensor  # (M, obs_dim), s_t; NaN where it is not known
+
+    def __add__(self, other: _Rows) -> _Rows:
+        return _Rows(*(th.cat(pair) for pair in zip(vars(self).values(), vars(other).values(), strict=True)))
+
+    def __getitem__(self, rows: th.Tensor | slice) -> _Rows:
+        return _Rows(*(part[rows] for part in vars(self).values()))
+
+
+def distill(model: SAID, config: Distillation) -> float:
+    """Train the policy's student, and return its error: the root mean square over labels that it did not learn from.
+
+    :param model: with a trained planner, and a replay or an environment; without a replay, the planner's own visits
+        take its place
+    """
+    model.policy.set_training_mode(False)
+    student, generator = model.policy.student, th.Generator().manual_seed(model.seed or 0)
+    if model.replay_buffer is not None and model.replay_buffer.size() > 0:
+        parts = [_replayed(model, config, generator) for _ in range(-(-config.n_labels // LABELLED_AT_ONCE))]
+        rows = sum(parts[1:], parts[0])[: config.n_labels]
+    else:
+        rows = _visited(model, "planner", config.n_labels)
+    n_held_out = int(HELD_OUT * len(rows.inputs))
+    held_out, rows = rows[:n_held_out], rows[n_held_out:]
+    student.fit(rows.inputs)
+    optimizer = th.optim.Adam(student.network.parameters(), lr=config.learning_rate)
+    schedule = th.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, config.gradient_steps)
+    rounds = config.rounds if model.env is not None and config.own_steps > 0 else 0
+    for k in range(config.gradient_steps):
+        if k > 0 and rounds and k % -(-config.gradient_steps // (rounds + 1)) == 0:
+            rows = rows + _visited(model, "student", -(-config.own_steps // rounds))
+        drawn = th.randint(len(rows.inputs), (config.batch_size,), generator=generator).to(rows.inputs.device)
+        loss = _loss(model, rows[drawn], config.q_weight)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+    with th.no_grad():
+        left = held_out if n_held_out else rows
+        return float(F.mse_loss(student.answer(left.inputs), left.labels).sqrt())
+
+
+def _loss(model: SAID, batch: _Rows, q_weight: float) -> th.Tensor:
+    answers = model.policy.student.answer(batch.inputs)
+    loss = F.mse_loss(answers, batch.labels)
+    is_known = ~batch.presents.isnan().any(1)
+    if q_weight > 0 and is_known.any():
+        values = model.policy.values  # learned offline, where there are no critics
+        q_value = model.policy.q_value if values is None else values.q_value
+        q = q_value(batch.presents[is_known], answers[is_known])
+        loss = loss - q_weight * q.mean() / q.abs().mean().detach().clamp(min=1e-6)
+    return loss
+
+
+@th.no_grad()
+def _labelled(model: SAID, parts: dict[str, th.Tensor], presents: th.Tensor) -> _Rows:
+    """Ask the planner at temperature 0 about delayed observations."""
+    batches = zip(*(parts[key].split(LABELLED_AT_ONCE) for key in KEYS), strict=True)
+    labels = [
+        model.policy.planner.plan(states, history, delay[:, 0].long(), temperature=0.0).action
+        for states, history, delay in batches
+    ]
+    is_delayed = isinstance(model.observation_space, spaces.Dict)
+    inputs = model.policy.student.read(parts if is_delayed else parts["observation"])
+    return _Rows(inputs, th.cat(labels), presents)
+
+
+def _replayed(model: SAID, config: Distillation, generator: th.Generator) -> _Rows:
+    """Label observations of the replay, seen at ages that the planner plans at."""
+    planner, n, max_delay = model.policy.planner, LABELLED_AT_ONCE, model.policy.max_delay
+    source = model.replay_buffer.window_source(model.planner_newest_fraction, model.get_vec_normalize_env())
+    windows = source.sample(n, max_delay + 1, generator)
+    ages = th.full((n,), max_delay)
+    if planner.config.mask == "random":
+        ages = th.randint(max_delay + 1, (n,), generator=generator)
+    ages = th.minimum(ages, windows.valid.sum(1) - 1)  # (B,): s_t is in the window
+    steps = th.arange(max_delay) - (max_delay - ages)[:, None]  # (B, D): index of each action in the window
+    history = windows.actions.gather(1, steps.clamp(min=0)[..., None].expand(-1, -1, planner.act_dim))
+    history = th.where(steps[..., None] >= 0, history, 0.0)
+    presents = windows.states[th.arange(n), ages]
+    parts = {"observation": windows.states[:, 0], "action_history": history, "delay": ages[:, None].float()}
+    device = model.device
+    return _labelled(model, {key: part.to(device) for key, part in parts.items()}, presents.to(device))
+
+
+def _visited(model: SAID, who: str, n_steps: int) -> _Rows:
+    """Play the training environment, and label where that leads. It starts a new episode afterwards."""
+    env, normalizer = model.get_env(), model.get_vec_normalize_env()
+    was_training = normalizer is not None and normalizer.training
+    if normalizer is not None:
+        normalizer.training = False
+    visited: list[dict[str, th.Tensor]] = []
+    try:
+        with model.policy.answering(who):
+            obs = env.reset()
+            for _ in range(-(-n_steps // env.num_envs)):
+                given = model.policy.obs_to_tensor(obs)[0]
+                visited.append(given if isinstance(given, dict) else _undelayed(given, model.policy.planner.act_dim))
+                obs = env.step(model.predict(obs, deterministic=True)[0])[0]
+    finally:
+        model._last_obs = None  # SB3 then resets the environments
+        if normalizer is not None:
+            normalizer.training = was_training
+    parts = {key: th.cat([each[key] for each in visited]) for key in KEYS}
+    return _labelled(model, parts, th.full_like(parts["observation"], th.nan))
+
+
+def _undelayed(states: th.Tensor, act_dim: int) -> dict[str, th.Tensor]:
+    """Return observations of a task without delay as delayed ones of max_delay 0."""
+    n = len(states)
+    return {"observation": states, "action_history": states.new_zeros(n, 0, act_dim), "delay": states.new_zeros(n, 1)}

@@ -1,0 +1,316 @@
+"""The loop's threads: who waits for whom, what becomes of answers, and what is counted."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+from recorder import Gated, Planning, Recorder, assert_honest, plan_of
+from small_agent import make
+from small_task import Drift
+
+from sb3_said.realtime import ControlLoop, LoopedModel, NoAnswer, ticks
+
+TASK = Drift()
+ZEROS = np.zeros(2, np.float32)
+
+
+def in_steps(model, n=0, **kwargs):
+    """Return a loop that counts steps, whose answers take n."""
+    loop = ControlLoop(model, 1, simulate=lambda seconds: n, **{"answer_steps": n, **kwargs})
+    model.asked.clear()
+    return loop
+
+
+def test_act_does_not_wait_for_the_model():
+    model = Gated(TASK, 4)
+    with ControlLoop(model, 1, answer_steps=0) as loop:
+        model.gate.clear()
+        model.is_computing.clear()
+        loop.observe(ZEROS, n_executed=0)
+        assert model.is_computing.wait(60)
+        np.testing.assert_array_equal([loop.act(t) for t in range(3)], np.zeros((3, 1)))  # and the model still computes
+        assert not loop.wait(0)
+        model.gate.set()
+        assert loop.wait(60)
+        found = loop.statistics()
+        assert (found.waiting_steps, found.late_answers) == (3, 1)
+        assert found.answer_steps == {3: 1, 0: 1}  # then it was asked again, since nothing else was heard
+        assert [int(asked["delay"][0]) for asked in model.asked[-2:]] == [0, 3]
+        np.testing.assert_array_equal(loop.act(3), plan_of(model.asked[-1], TASK.action_space, 1)[0])
+
+
+def test_an_answer_of_another_episode_is_dropped():
+    model = Gated(TASK, 4)
+    with ControlLoop(model, 1) as loop:
+        model.gate.clear()
+        model.is_computing.clear()
+        loop.observe(ZEROS + 5, n_executed=0)
+        assert model.is_computing.wait(60)
+        loop.reset()
+        model.gate.set()
+        assert loop.wait(60)
+        assert loop.act(0) == 0 and loop.statistics().answer_steps == {} and loop.n_sent == 1
+
+
+def test_an_observation_that_comes_while_the_model_computes_is_answered_next():
+    model = Gated(TASK, 4)
+    with ControlLoop(model, 1, answer_steps=0) as loop:
+        model.asked.clear()
+        model.gate.clear()
+        model.is_computing.clear()
+        loop.observe(ZEROS, n_executed=0)
+        assert model.is_computing.wait(60)
+        for k in (1, 2, 3):
+            loop.observe(ZEROS + k, n_executed=0)
+        model.gate.set()
+        assert loop.wait(60)
+        assert [asked["observation"][0] for asked in model.asked] == [0, 3]  # those between are out of date
+
+
+def test_where_no_observation_comes_the_last_is_asked_about_again_a_step_older():
+    model = Recorder(TASK, 2)
+    with ControlLoop(model, 1, answer_steps=0) as loop:
+        model.asked.clear()
+        loop.observe(ZEROS, capture_time=0)
+        for t in range(5):
+            loop.wait(60)
+            loop.act(t)
+        assert loop.wait(60)
+    assert [int(asked["delay"][0]) for asked in model.asked] == [
+        0,
+        2,
+    ]  # not after act(0), which had heard of it; 3 is too old
+
+
+def test_a_robot_that_stands_until_the_plan_is_there_begins_with_it():
+    model = Planning(TASK, 4)
+    with ControlLoop(model, 1, answer_steps=2) as loop:
+        for _ in range(2):
+            loop.reset()
+            model.asked.clear()
+            assert loop.wait(60) and model.asked == []  # nothing has been seen
+            loop.observe(ZEROS, n_executed=0)
+            assert loop.wait(60) and loop.wait(60)
+            assert [int(asked["delay"][0]) for asked in model.asked] == [2, 0]  # on the move, and standing
+            wanted = plan_of(model.asked[-1], TASK.action_space, 4)
+            np.testing.assert_array_equal([loop.act(t) for t in range(2)], wanted[:2])
+            assert loop.wait(60) and int(model.asked[-1]["delay"][0]) == 4
+        assert loop.statistics().waiting_steps == 0
+
+
+def test_threads_that_observe_act_and_answer_at_once_keep_the_books_right():
+    """Whatever the interleaving: a model is told what has been and will be sent, and the age that follows from it."""
+
+    class Tired(Planning):
+        def predict(self, *args, **kwargs):
+            time.sleep(next(naps))
+            return super().predict(*args, **kwargs)
+
+    naps = iter(np.random.default_rng(0).choice([0, 2e-4, 3e-3], 100_000))
+    model, n_steps = Tired(TASK, 8), 400
+    loop, stop, failures = ControlLoop(model, 1e-3), threading.Event(), []
+    model.asked.clear()
+    requests, take = [], loop._take
+
+    def recorded(request, actions):
+        requests.append(request)
+        take(request, actions)
+
+    loop._take = recorded
+
+    def sense(seed):
+        rng = np.random.default_rng(seed)
+        while not stop.is_set():
+            n = max(loop.n_sent - int(rng.integers(3)), 0)
+            try:
+                loop.observe(np.float32([n, seed]), n_executed=n)
+            except Exception as error:
+                failures.append(error)
+            time.sleep(rng.choice([0, 1e-4, 2e-3]))
+
+    threads = [threading.Thread(target=sense, args=(seed,)) for seed in range(2)]
+    for thread in threads:
+        thread.start()
+    sent = []
+    try:
+        for _ in range(n_steps):
+            sent.append(loop.act())
+            time.sleep(5e-4)
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join()
+        loop.close()
+    assert failures == [] and len(requests) > 20 and loop.n_sent == n_steps
+    found = loop.statistics()
+    assert_honest(requests, np.array(sent) / 2, lambda observation: int(observation[0]), found)
+    assert found.steps == n_steps and found.ages.total() > n_steps / 2 and found.answer_steps.total() == len(requests)
+
+
+def test_a_model_that_fails_is_heard_of_where_the_robot_is():
+    class Failing(Recorder):
+        def predict(self, observation, **kwargs):
+            if observation["observation"][0, 0] > 0:
+                raise ValueError("too hot")
+            return super().predict(observation)
+
+    with ControlLoop(Failing(TASK, 2), 1) as loop:
+        loop.observe(ZEROS, n_executed=0)
+        loop.wait(60)
+        loop.act(0)
+        loop.observe(ZEROS + 1, n_executed=1)
+        with pytest.raises(RuntimeError, match="The model failed: too hot"):
+            loop.wait(60)
+        with pytest.raises(RuntimeError, match="too hot"):
+            loop.act(1)
+    with pytest.raises(RuntimeError, match="too hot"):
+        ControlLoop(Failing(TASK, 2), 1, normalize=lambda obs: obs | {"observation": ZEROS[None] + 1})
+
+
+def test_a_closed_loop_says_so_and_leaves_no_thread():
+    loop = ControlLoop(Recorder(TASK, 2), 1)
+    loop.close()
+    loop.close()
+    assert not loop._worker.is_alive()
+    with pytest.raises(RuntimeError, match="closed"):
+        loop.act(0)
+
+
+def test_holding_the_safe_action_and_giving_up_are_counted():
+    loop = in_steps(Recorder(TASK, 1), hold_steps=2, safe_steps=2, safe_action=[-1.0])
+    loop.observe(ZEROS, n_executed=0)
+    sent = [float(loop.act(t)[0]) for t in range(2)]  # of ages 0 and 1
+    assert sent[0] != sent[1]
+    assert [float(loop.act(t)[0]) for t in range(2, 6)] == [sent[1], sent[1], -1, -1]
+    with pytest.raises(NoAnswer, match=r"No action was planned for 5 steps.*held 2, safe 2"):
+        loop.act(6)
+    assert loop.n_sent == 6
+    loop.observe(ZEROS, n_executed=6)  # the sensor is back
+    assert loop.act(7) not in (-1, sent[1])
+
+
+@pytest.mark.parametrize(("n", "expected"), [(0, 0), (1, 1), (2, 2)])
+def test_it_expects_what_answers_took(n, expected):
+    """So that each is planned for the step at which it arrives: none is late, and no step without a plan."""
+    loop = in_steps(Planning(TASK, 4), n, answer_steps=None)
+    for t in range(30):
+        loop.observe(ZEROS, n_executed=t)
+        loop.act(t)
+    found = loop.statistics()
+    assert loop.answer_steps == expected and set(found.answer_steps) == {n}
+    assert found.waiting_steps == n and found.late_answers == found.held_steps == 0
+
+
+def test_an_answer_later_than_expected_is_spliced_by_what_was_consumed():
+    model = Planning(TASK, 8)
+    loop = in_steps(model, 2, answer_steps=1)
+    sent = []
+    for t in range(7):
+        loop.observe(ZEROS + t, n_executed=t)
+        sent.append(loop.act(t))
+    plans = [model.predict_plan({key: value[None] for key, value in asked.items()})[0] for asked in model.asked[:3]]
+    # Asked at 0, 2 and 4 for the actions from 1, 3 and 5 on; arrived at 2, 4 and 6
+    np.testing.assert_array_equal(sent[2:], [plans[0][1], plans[0][2], plans[1][1], plans[1][2], plans[2][1]])
+    assert loop.statistics().late_answers == 3
+    assert [int(asked["delay"][0]) for asked in model.asked[:3]] == [1, 1, 1]
+
+
+def test_a_loop_that_ignores_its_latency_sends_what_was_meant_for_an_earlier_state():
+    model = Planning(TASK, 8)
+    loop = in_steps(model, 2, count_latency=False, hold_steps=None)
+    sent = []
+    for t in range(6):
+        loop.observe(ZEROS + t, n_executed=t)
+        sent.append(loop.act(t))
+    assert [int(asked["delay"][0]) for asked in model.asked] == [0, 0, 0]
+    first = [model.predict_plan({key: value[None] for key, value in asked.items()})[0][0] for asked in model.asked[:2]]
+    np.testing.assert_array_equal(sent[2:], [first[0], first[0], first[1], first[1]])
+    assert loop.statistics().held_steps == 2
+
+
+def test_statistics_are_a_dict_a_line_and_rows_of_a_logger():
+    loop = in_steps(Recorder(TASK, 4))
+    for t, now in enumerate([0, 1, 2, 4, 5]):
+        if t != 3:
+            loop.observe(ZEROS, capture_time=now)
+        loop.observe(ZEROS, capture_time=0)
+        loop.act(now)
+    found = loop.statistics()
+    numbers = found.to_dict()
+    assert (numbers["steps"], numbers["overruns"], numbers["stale_observations"]) == (5, 1, 5)
+    assert [numbers[f"age_{key}"] for key in ("p50", "p95", "p99", "max")] == [0, 1, 1, 1]
+    assert (numbers["gap_p50"], numbers["gap_max"], numbers["answer_steps_max"]) == (1, 2, 0)
+    line = str(found)
+    assert "age 0/1/1/1" in line and "overruns 1" in line and "stale 5" in line and "\n" not in line
+    loop.act(6)
+    assert found.steps == 5  # a copy
+    assert "age -/-/-/-" in str(in_steps(Recorder(TASK, 4)).statistics())
+
+
+def test_statistics_go_to_tensorboard(tmp_path):
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    from stable_baselines3.common.logger import configure
+
+    loop = in_steps(Recorder(TASK, 4))
+    loop.observe(ZEROS, n_executed=0)
+    loop.act(0)
+    logger = configure(str(tmp_path), ["tensorboard"])
+    loop.statistics().record(logger)
+    logger.dump(7)
+    logger.close()
+    events = accumulator.EventAccumulator(str(tmp_path))
+    events.Reload()
+    (event,) = events.Scalars("realtime/steps")
+    assert (event.step, event.value) == (7, 1) and "realtime/age_p99" in events.Tags()["scalars"]
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"period": 0}, "period is 0"),
+        ({"max_age": 5}, r"max_age is 5, but the model reads ages 0..4"),
+        ({"hold_steps": -1}, "hold_steps"),
+        ({"safe_action": [3.0]}, "safe_action is"),
+        ({"safe_action": [0.0, 0.0]}, "safe_action is"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        ControlLoop(Recorder(TASK, 4), **{"period": 1, "simulate": lambda seconds: 0, **kwargs})
+
+
+def test_stamps_of_another_clock_are_refused():
+    loop = ControlLoop(Recorder(TASK, 4), 0.02, simulate=lambda seconds: 0)
+    loop.observe(ZEROS, capture_time=time.time())
+    with pytest.raises(ValueError, match="one clock"):
+        loop.act(time.monotonic())
+
+
+def test_an_agent_without_delay():
+    plain = make(Drift(length=1000))  # untrained, so that the expert answers
+    loop = ControlLoop(plain, 1, simulate=lambda seconds: 0)
+    loop.observe(ZEROS, n_executed=0)
+    np.testing.assert_array_equal(loop.act(0), plain.predict(ZEROS, deterministic=True)[0])
+
+
+def test_ticks_come_once_a_period_and_make_up_for_none():
+    now = [0.0]
+
+    def sleep(seconds):
+        now[0] += seconds
+
+    beat = ticks(1.0, lambda: now[0], sleep)
+    assert [next(beat), next(beat)] == [0, 1]
+    now[0] += 0.75  # what the body of the loop takes
+    assert next(beat) == 2
+    now[0] += 3.5  # too long
+    assert [next(beat), next(beat)] == [5.5, 6.5]
+    with pytest.raises(ValueError, match="period is 0"):
+        next(ticks(0))
+
+
+def test_a_looped_model_plays_one_environment():
+    loop = in_steps(Recorder(TASK, 4))
+    with pytest.raises(ValueError, match="one environment, got 2"):
+        LoopedModel(loop).predict({"observation": np.zeros((2, 2)), "delay": np.zeros((2, 1))})

@@ -1,0 +1,66 @@
+"""An exported student answers as the agent does, to float32's precision, and runs a loop without PyTorch."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from small_agent import make, observe
+from small_task import Drift, delayed
+from stable_baselines3.common.utils import set_random_seed
+
+from sb3_said.realtime import OnnxModel
+from sb3_said.said.export import export
+
+pytest.importorskip("onnx")
+pytest.importorskip("onnxruntime")
+
+
+class Uneven(Drift):
+    action_space = spaces.Box(np.float32([-2.0]), np.float32([0.5]))
+
+
+@pytest.mark.parametrize("task", ["delayed", "plain"])
+def test_it_answers_as_the_agent(task, tmp_path):
+    env = delayed() if task == "delayed" else Uneven()
+    model = make(env)
+    set_random_seed(0)
+    model.policy.make_student(16)
+    student = model.policy.student
+    rng = np.random.default_rng(0)
+    obs = observe(env=env) if task == "delayed" else rng.normal(size=(7, 2)).astype(np.float32)
+    student.fit(student.read(model.policy.obs_to_tensor(obs)[0]))
+    for layer in student.network[::2]:
+        layer.weight.data *= 2
+    export(model.policy, tmp_path / "agent.onnx")
+    loaded = OnnxModel(tmp_path / "agent.onnx")
+    with model.policy.answering("student"):
+        wanted = model.predict(obs, deterministic=True)[0]
+    assert wanted.std() > 0.1
+    np.testing.assert_allclose(loaded.predict(obs)[0], wanted, rtol=1e-5, atol=1e-6)
+    assert loaded.action_space == model.action_space
+    assert loaded.observation_space == model.observation_space
+
+
+def test_a_loop_runs_it_without_pytorch(tmp_path):
+    model = make()
+    model.policy.make_student(16)
+    export(model.policy, tmp_path / "agent.onnx")
+    code = f"""
+import sys, numpy as np
+from sb3_said.realtime import ControlLoop, OnnxModel
+loop = ControlLoop(OnnxModel({str(tmp_path / "agent.onnx")!r}), 1, simulate=lambda seconds: 0)
+loop.observe(np.ones(2), n_executed=0)
+print(loop.act(0)[0], *{{"torch", "stable_baselines3"}} & sys.modules.keys())
+"""
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    obs = {"observation": np.ones(2), "action_history": np.zeros((2, 1)), "delay": np.zeros(1)}
+    with model.policy.answering("student"):
+        assert float(done.stdout) == pytest.approx(model.predict(obs, deterministic=True)[0][0], rel=1e-5)
+
+
+def test_without_a_student_there_is_nothing_to_export(tmp_path):
+    with pytest.raises(ValueError, match=r"no student to export; call distill\(\)"):
+        export(make().policy, tmp_path / "agent.onnx")
+    assert not any(tmp_path.iterdir())

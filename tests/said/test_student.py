@@ -1,0 +1,168 @@
+"""The student answers as its planner, on what it was shown and where it goes itself; and lives in the agent's file."""
+
+import numpy as np
+import pytest
+import torch as th
+from small_agent import answer, make, observe
+from small_task import Drift, delayed
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_said import SAID
+from sb3_said.delays.space import delayed_space
+from sb3_said.sac.extractors import StateAugmentedExtractor
+from sb3_said.said import student as student_module
+from sb3_said.said.student import Distillation, Student
+
+QUICK = {"width": 32, "n_labels": 700, "own_steps": 60, "rounds": 2, "gradient_steps": 400, "batch_size": 64}
+
+
+@pytest.fixture(scope="module")
+def taught():
+    """An agent whose planner is at temperature 0, with its student; tests must leave it as it is."""
+    model = with_answers(make(planner_kwargs={"temperature": 0.0}).learn(60))
+    model.error = model.distill(**QUICK)
+    return model
+
+
+def with_answers(model):
+    """Give the planner weights of which every input shows in the answer."""
+    generator = th.Generator().manual_seed(1)
+    for parameter in model.policy.planner.parameters():
+        th.nn.init.normal_(parameter, std=0.15, generator=generator)
+    return model
+
+
+@pytest.fixture
+def pupil(taught):
+    """The same agent, for tests that distill another student."""
+    before = taught.policy.student
+    yield taught
+    taught.policy.student, taught.student_width = before, before.width
+
+
+def test_it_answers_as_the_planner_and_an_untaught_one_does_not(taught):
+    obs = observe()
+    with taught.policy.answering("planner"):
+        wanted = answer(taught, obs)
+    with taught.policy.answering("student"):
+        found = answer(taught, obs)
+        np.testing.assert_array_equal(answer(taught, {key: value[3] for key, value in obs.items()}), found[3])
+        np.testing.assert_array_equal(taught.predict_plan(obs, deterministic=True)[:, 0], found)
+    untaught = Student(taught.observation_space, taught.action_space, 32)(taught.policy.obs_to_tensor(obs)[0])
+    error, spread = np.abs(found - wanted).max(), np.abs(wanted - wanted.mean(0)).max()
+    assert spread > 0.2 and error < 0.15 * spread < np.abs(2 * untaught.detach().numpy() - wanted).max()
+    assert 0 < taught.error < 0.15
+
+
+def test_the_labels_are_the_planners_at_temperature_0_at_every_age(taught, monkeypatch):
+    model, seen = taught, []
+    plan = model.policy.planner.plan
+
+    def recorded(*args, **kwargs):
+        made = plan(*args, **kwargs)
+        seen.append((args, kwargs, made.action))
+        return made
+
+    monkeypatch.setattr(model.policy.planner, "plan", recorded)
+    rows = student_module._replayed(model, Distillation(), th.Generator().manual_seed(0))
+    ((states, history, delay), kwargs, action) = seen[0]
+    assert kwargs == {"temperature": 0.0} and sorted(set(delay.tolist())) == [0, 1, 2]
+    assert th.equal(rows.labels, action)
+    reader = StateAugmentedExtractor(model.observation_space)
+    obs = {"observation": states, "action_history": history, "delay": delay[:, None].float()}
+    assert th.equal(rows.inputs, reader(obs))
+    # Each row is a place of the replay: the state, the actions from there on, and the state that they lead to
+    buffer, stored = model.replay_buffer, model.replay_buffer.observations[:, 0]
+    for k in range(20):
+        age, (place, *_) = int(delay[k]), np.flatnonzero((stored == states[k].numpy()).all(1))
+        np.testing.assert_array_equal(rows.presents[k], stored[place + age])
+        np.testing.assert_array_equal(history[k, 2 - age :], buffer.actions[place : place + age, 0])
+        assert not history[k, : 2 - age].any()
+
+
+def test_a_file_keeps_it_and_who_answers(taught, tmp_path):
+    assert taught.policy.who_answers == "planner" and taught.policy.answers == ["planner", "expert", "student"]
+    taught.set_answer("student")
+    try:
+        wanted = answer(taught, observe())
+        taught.save(tmp_path / "agent.zip")
+        taught.policy.save(tmp_path / "policy.zip")
+    finally:
+        taught.set_answer("planner")
+    assert taught.policy.who_answers == "planner"
+    loaded = SAID.load(tmp_path / "agent.zip", device="cpu")
+    assert loaded.policy.who_answers == "student" and loaded.student_width == 32
+    np.testing.assert_array_equal(answer(loaded, observe()), wanted)
+    np.testing.assert_array_equal(answer(type(loaded.policy).load(tmp_path / "policy.zip"), observe()), wanted)
+    with pytest.raises(ValueError, match="Nothing to learn from"):
+        loaded.distill()
+    again = SAID.load(tmp_path / "agent.zip", env=delayed(), device="cpu")
+    assert again.distill(**{**QUICK, "n_labels": 100, "gradient_steps": 50}) < 1  # by the planner's own visits
+
+
+def test_it_learns_where_it_goes_itself(pupil, monkeypatch):
+    visits, visited = [], student_module._visited
+    monkeypatch.setattr(student_module, "_visited", lambda m, who, n: visits.append((who, n)) or visited(m, who, n))
+    pupil.distill(**{**QUICK, "n_labels": 100, "gradient_steps": 30})
+    assert visits == [("student", 30), ("student", 30)]
+    rows = visited(pupil, "student", 30)
+    assert rows.inputs.shape == (30, 2 + 2 + 1) and rows.presents.isnan().all()
+    with th.no_grad():  # in Drift the action moves the first entry of the state, and is the last of the next history
+        states, history = rows.inputs[:, :2], rows.inputs[:, 2:4]
+        own = pupil.policy.student.answer(rows.inputs)
+    follows = rows.inputs[:-1, -1] <= rows.inputs[1:, -1]  # where no episode ends
+    th.testing.assert_close(history[1:, -1][follows], own[:-1, 0][follows], rtol=1e-5, atol=1e-6)
+    assert states.std() > 0 and pupil._last_obs is None  # the next learn() starts a new episode
+
+
+def test_the_critics_can_have_a_say(pupil):
+    def taught_by(q_weight):
+        pupil.distill(**{**QUICK, "own_steps": 0, "q_weight": q_weight})
+        rows = student_module._replayed(pupil, Distillation(), th.Generator().manual_seed(1))
+        with th.no_grad():
+            answers = pupil.policy.student.answer(rows.inputs)
+            return pupil.policy.q_value(rows.presents, answers).mean(), (answers - rows.labels).square().mean()
+
+    (plain_q, plain_error), (q, error) = taught_by(0.0), taught_by(0.5)
+    assert q > plain_q and error > plain_error
+
+
+@pytest.mark.parametrize("normalized", [False, True])
+def test_without_delay_and_with_normalized_observations(normalized):
+    env = make_vec_env(delayed if normalized else Drift, 2)
+    env = VecNormalize(env, norm_obs_keys=["observation"]) if normalized else env
+    model = with_answers(make(env, planner_kwargs={"temperature": 0.0}).learn(30))
+    before = env.obs_rms["observation"].mean.copy() if normalized else None
+    assert model.distill(**{**QUICK, "gradient_steps": 200}) < 0.2
+    if normalized:
+        np.testing.assert_array_equal(env.obs_rms["observation"].mean, before)
+        assert env.training
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [({"width": 0}, "student_width is 0"), ({"batch_size": 0}, "batch_size"), ({"q_weight": -1.0}, "q_weight")],
+)
+def test_settings_that_cannot_be_are_refused_and_the_student_stays(taught, settings, message):
+    before = taught.policy.student
+    with pytest.raises(ValueError, match=message):
+        taught.distill(**{**QUICK, **settings})
+    assert taught.policy.student is before and taught.student_width == 32
+
+
+def test_who_is_not_there_cannot_answer():
+    model = make()
+    assert model.policy.answers == ["expert"]
+    with pytest.raises(ValueError, match=r"no student yet; call distill\(\)"):
+        model.set_answer("student")
+    with pytest.raises(ValueError, match="not trained yet"):
+        model.distill()
+
+
+def test_it_is_small_and_reads_no_state_history():
+    env = delayed()
+    student = Student(env.observation_space, env.action_space, 256)
+    assert sum(p.numel() for p in student.parameters()) < 100_000
+    wider = delayed_space(Drift.observation_space, Drift.action_space, 2, state_history=True)
+    assert Student(wider, env.action_space, 8).mean.shape == (5,)
