@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -88,16 +89,18 @@ def write_dataset(
                 infos={},
             )
         )
-    _minari().create_dataset_from_buffers(
-        os.fspath(target),
-        buffers,
-        env=spec,
-        algorithm_name=algorithm,
-        description=about,
-        observation_space=state_space,
-        action_space=env.action_space,
-        **scores,
-    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # that nobody is named as its author, nor a link to its code
+        _minari().create_dataset_from_buffers(
+            os.fspath(target),
+            buffers,
+            env=spec,
+            algorithm_name=algorithm,
+            description=about,
+            observation_space=state_space,
+            action_space=env.action_space,
+            **scores,
+        )
 
 
 def _minari() -> Any:

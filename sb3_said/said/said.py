@@ -385,7 +385,7 @@ class SAID(OfflineAlgorithm, StableSAC):
 
         def on_step(n_updates: int) -> bool:
             self.num_timesteps = n_updates
-            if n_updates % HAND_OVER_INTERVAL == 0:
+            if n_updates % HAND_OVER_INTERVAL == 0 or n_updates == 1:  # else an expert that learns nothing would answer
                 training.hand_over()
             return self._goes_on(watcher)
 

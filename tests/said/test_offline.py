@@ -101,7 +101,7 @@ def test_callbacks_follow_each_update_meet_a_young_planner_and_can_end_it(monkey
             return self.num_timesteps < 5
 
     model = learn(callback=Watch())
-    assert seen == [(1, 0), (2, 2), (3, 2), (4, 4), (5, 4)]
+    assert seen == [(1, 1), (2, 2), (3, 2), (4, 4), (5, 4)]
     assert model.num_timesteps == model.policy.planner_updates == 5
 
 

@@ -84,6 +84,7 @@ def test_a_run_leaves_its_agent_record_log_and_evaluations(finished: tuple[str, 
     assert model._n_updates == (20 if algo == "bc" else 0)  # no expert learns beside a planner
     assert Record.read(run).dataset == [str(log)]
     assert np.load(run / "evaluations.npz")["timesteps"].tolist() == [10, 20]
+    assert answers(load_run(run / "best_model.zip", device="cpu").model) == answers(model)
     assert not list(run.glob("*monitor.csv")) and not (run / "expert").exists()
     column = "train/action_error" if algo == "bc" else "iql/v_loss"
     assert column in (run / "progress.csv").read_text()
