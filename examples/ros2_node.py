@@ -67,7 +67,8 @@ class ControlNode(Node):
             self.get_logger().error(f"Observation dropped: {error}")
 
     def act(self) -> None:
-        self.publish(self.loop.act())
+        if self.stamp is not None:  # until the robot speaks, nothing is sent
+            self.publish(self.loop.act())
 
     def beat(self) -> None:
         self.heartbeat.publish(String(data=str(self.loop.statistics())))

@@ -152,7 +152,10 @@ def test_the_ros_node_ends_with_the_safe_action(end: str, ros: Any, monkeypatch:
 
     def spin(node: Any) -> None:
         nodes.append(node)
-        node.timers[0.5]()
+        node.timers[0.5]()  # sends nothing yet
+        assert node.published["/arm"] == []
+        node.subscribed["/joint_states"](joint_state([np.nan], [0.0], time.time_ns()))
+        node.timers[0.5]()  # the robot speaks, if nonsense
         if end == "SIGTERM":
             os.kill(os.getpid(), signal.SIGTERM)
             time.sleep(60)
