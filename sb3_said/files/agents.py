@@ -45,7 +45,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
     own_classes: ClassVar[tuple[type, ...]] = ()
 
     task: str | None = None
-    """id of the Gymnasium task that it was made for, or loaded with"""
+    """id of the Gymnasium task that it was made for, where that is known"""
 
     def save(self, path: PathOrFile, compact: bool = False) -> None:  # type: ignore[override]  # no exclude, include
         """Write the agent to a file, without its environment and replay buffer.
@@ -90,8 +90,6 @@ class SafeSaveMixin(OffPolicyAlgorithm):
             tree["parameters"]["policy"] = {name: _in_half(value) for name, value in parameters["policy"].items()}
         if isinstance(path, (str, os.PathLike)) and pathlib.Path(path).suffix == "":
             path = f"{os.fspath(path)}.zip"
-        if self.env is not None and (spec := self.env.get_attr("spec", 0)[0]) is not None:
-            self.task = spec.id
         save_tree(path, tree, {"task": self.task}, kind=type(self).__name__)
 
     @classmethod

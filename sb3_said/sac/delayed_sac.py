@@ -15,7 +15,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn, Schedule
-from stable_baselines3.common.vec_env import unwrap_vec_normalize
+from stable_baselines3.common.vec_env import DummyVecEnv, unwrap_vec_normalize
 
 from sb3_said.delays.space import ages_of, check_one_max_delay, check_spaces, written_ages
 from sb3_said.files.agents import SafeSaveMixin
@@ -122,6 +122,13 @@ class DelayedSAC(SafeSaveMixin, SAC):
         self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "relabelled_ages": self.relabelled_ages}
         super()._setup_model()
         self.policy_kwargs, self.replay_buffer_kwargs = user_kwargs
+        self._note_task()
+
+    def _note_task(self) -> None:
+        """Remember the task's id, which files name; of environments in other processes whoever makes them may know."""
+        env = None if self.env is None else self.env.unwrapped
+        if isinstance(env, DummyVecEnv) and env.envs[0].spec is not None:
+            self.task = env.envs[0].spec.id
 
     def _check_env(self, env: GymEnv) -> None:
         """Refuse spaces that are not served, and what no space tells of an environment, with a ``ValueError``."""
@@ -181,6 +188,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
             )
         self.check_ages(ages_of(env))
         super().set_env(env, force_reset)
+        self._note_task()
 
     def check_ages(self, ages: list[int]) -> None:
         """Warn where an agent is to act on observations of ages that it has not met in training, amid episodes.

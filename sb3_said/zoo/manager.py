@@ -270,6 +270,7 @@ class DelayedExperimentManager(ExperimentManager):
         return self.checkpointing.save()
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
+        model.task = self.env_name.gym_id  # which environments in other processes do not tell
         super().save_trained_model(model)
         vec_normalize = model.get_vec_normalize_env()
         if vec_normalize is not None:

@@ -55,11 +55,10 @@ class LoadedRun:
 
         :param age_error: control steps that the age is told wrong by, within what the agent was built for
         """
-        max_delay = longest_delay(self.model) or 0
 
         def read(observation: Observation) -> Observation:
             if age_error:
-                age = np.clip(observation["delay"] + age_error, 0, max_delay)
+                age = np.clip(observation["delay"] + age_error, 0, longest_delay(self.model))
                 observation = {**observation, "delay": age.astype(np.float32)}
             return observation if self.normalize is None else self.normalize(observation)
 

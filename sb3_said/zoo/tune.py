@@ -26,7 +26,7 @@ from sb3_said.zoo.best import write_best
 from sb3_said.zoo.depths import DepthPlanners
 from sb3_said.zoo.evaluate import evaluate, print_table
 from sb3_said.zoo.record import Record
-from sb3_said.zoo.runs import LoadedRun, load_run, origin
+from sb3_said.zoo.runs import LoadedRun, answers, load_run, origin
 from sb3_said.zoo.search import DRAWN, describe, find_winner, finished, open_study, returns_of, save_plot, search
 
 EPILOG = f"""\
@@ -189,7 +189,11 @@ def report(args: argparse.Namespace, run: LoadedRun, study: Study, winner: Froze
         played = before["results"]
     else:
         how = (args.report_episodes, args.report_seed)
-        played = [evaluate(run, answer, *how, latency_calls=100).to_dict() for answer in RIVALS]
+        played = [
+            evaluate(run, answer, *how, latency_calls=100).to_dict()
+            for answer in RIVALS
+            if answer in answers(run.model)
+        ]
     run.model.save(folder / "best.zip")
     trials = [trial_to_dict(trial) for trial in finished(study)]
     choice = f"the best of {len(trials)} trials, mean return {winner.value:.1f} over {args.episodes} episodes"

@@ -11,7 +11,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
+from sb3_said import SAID, DelayedObservationWrapper, StableSAC
 from sb3_said.delays import UniformDelay
 
 
@@ -19,7 +19,7 @@ def test_value_is_the_smallest_critic(trained):
     policy = trained.policy
     states, actions = th.randn(3, 4, 5, 2), th.rand(3, 4, 5, 1) * 2 - 1
     critics = policy.critic({"undelayed_observation": states.reshape(-1, 2)}, actions.reshape(-1, 1))
-    expected = th.minimum(*critics).reshape(3, 4, 5)
+    expected = th.minimum(*critics).reshape(3, 4, 5) * policy.return_scale.value  # in units of rewards
     assert not th.equal(critics[0], critics[1])
     th.testing.assert_close(policy.value(states, actions), expected)
 
@@ -61,12 +61,17 @@ def test_the_candidate_of_the_highest_value_after_the_decision_answers(trained, 
     )
     assert plan.values.shape == (1, 4) and len(plan.values.unique()) > 1
     futures = plan.states[0, :, delay + 1 :], plan.actions[0, :, delay + 1 :]
-    scores = th.minimum(
-        *(
-            th.stack([policy.critic({"undelayed_observation": s}, a)[i][:, 0] for s, a in zip(*futures, strict=True)])
-            for i in (0, 1)
-        )
-    ).mean(1)
+    scores = (
+        th.minimum(
+            *(
+                th.stack(
+                    [policy.critic({"undelayed_observation": s}, a)[i][:, 0] for s, a in zip(*futures, strict=True)]
+                )
+                for i in (0, 1)
+            )
+        ).mean(1)
+        * policy.return_scale.value
+    )
     th.testing.assert_close(plan.values[0], scores)
     chosen = plan.actions[0, scores.argmax(), delay].numpy()
     np.testing.assert_allclose(answer(trained, obs), 2.0 * chosen, rtol=1e-6, atol=1e-6)  # actions run from -2 to 2
@@ -118,7 +123,7 @@ def test_deterministic_answers_repeat_bit_for_bit(trained, saved, who):
 @pytest.mark.parametrize("who", ["planner", "expert"])
 def test_deterministic_answers_are_made_row_by_row(trained, monkeypatch, who):
     # Products of larger matrices round differently, on some machines and at some widths.
-    owner, method = (trained.policy, "_plan") if who == "planner" else (trained.policy.actor, "forward")
+    owner, method = (trained.policy, "_plan") if who == "planner" else (trained.policy.averaged_actor, "forward")
     asked, original = [], getattr(owner, method)
 
     def ask(observation, *args, **kwargs):
@@ -176,8 +181,8 @@ def test_what_no_network_can_answer_is_refused(saved, who, temperature, determin
     model.set_planner(temperature=temperature)
     batch["observation"][3] = 1e30
     with model.policy.answering(who):
-        if who == "expert":  # its tanh saturates
-            assert np.abs(answer(model, batch, deterministic)).max() == 2.0
+        if who == "expert":  # it cuts z-scored states at 10, and its tanh saturates
+            assert np.abs(answer(model, batch, deterministic)).max() <= 2.0
         else:
             with pytest.raises(ValueError, match=r"1e\+30"):
                 answer(model, batch, deterministic)
@@ -187,7 +192,7 @@ def test_what_no_network_can_answer_is_refused(saved, who, temperature, determin
 def test_no_action_of_broken_networks_is_returned(saved, who):
     model, batch = SAID.load(saved, device="cpu"), observe()
     model.set_planner(temperature=0.0)
-    network = model.policy.planner.network if who == "planner" else model.policy.actor
+    network = model.policy.planner.network if who == "planner" else model.policy.averaged_actor
     for parameter in network.parameters():
         parameter.data.fill_(np.nan)
     with model.policy.answering(who):
@@ -208,7 +213,7 @@ def test_every_action_is_in_the_action_space(who):
     assert model.policy.unscale_action(np.ones(1, np.float32)) > np.float32(0.46)  # the rounding that this is about
     model.policy.planner_updates.fill_(1)
     model.policy.planner.normalizer.action_mean.fill_(5.0)  # saturates
-    model.policy.actor.mu.bias.data.fill_(50.0)
+    model.policy.averaged_actor.mu.bias.data.fill_(50.0)
     with model.policy.answering(who):
         (action,) = answer(model, observe(1, env))
     assert action > 0.45 and model.action_space.contains(action)
@@ -305,7 +310,7 @@ def test_an_agent_with_extra_states_is_saved_and_repeats(trained_with_extra_stat
 
 
 def test_the_expert_does_not_read_extra_states(trained_with_extra_states):
-    sac, plain = (make(remembering(flag), cls=DelayedSAC).learn(80) for flag in (True, False))
+    sac, plain = (make(remembering(flag), cls=StableSAC).learn(80) for flag in (True, False))
     assert same_replay(sac, plain) and same_replay(trained_with_extra_states, plain)
     for name, value in plain.policy.state_dict().items():
         assert th.equal(sac.policy.state_dict()[name], value), name
@@ -360,7 +365,7 @@ def test_a_plan_begins_with_the_answer_and_goes_on_as_the_chosen_candidate(train
         plan = trained.policy._plan(tensors, repeats=True)
         best = int(plan.values.argmax())
         assert plan.actions.shape[1] == 4
-        np.testing.assert_allclose(planned, 2 * plan.actions[0, best, d : d + 3].numpy(), rtol=1e-6)
+        np.testing.assert_allclose(planned, 2 * plan.actions[0, best, d : d + 3].numpy(), rtol=1e-5)
     set_random_seed(0)
     first = trained.predict_plan(obs)
     assert not np.array_equal(first, trained.predict_plan(obs))  # drawn anew

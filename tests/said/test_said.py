@@ -187,6 +187,7 @@ def test_every_argument_has_a_default_and_is_an_attribute():
         "planner_terminal_penalty": None,
         "planner_trial_episodes": 3,
         "value": "iql",
+        "student_width": 16,
     }
     assert [p.name for p in own] == list(given) and all(p.default is not p.empty for p in own)
     model = make(**given)

@@ -31,7 +31,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("logs")
     planner = ("planner_gradient_steps:3", "planner_trial_episodes:0", f"planner_kwargs:{PLANNER}")
     train_run(folder, "said", *planner, options=EVALUATED)
-    train_run(folder, "sadr", options=EVALUATED)
+    train_run(folder, "stable", options=EVALUATED)
     return folder
 
 
@@ -41,10 +41,10 @@ def returns_of(file: Path) -> dict[int, list[float]]:
 
 
 def test_planner_and_expert_are_told_apart(logs: Path) -> None:
-    (said,), (sadr,) = ((logs / algo).iterdir() for algo in ("said", "sadr"))
+    (said,), (stable,) = ((logs / algo).iterdir() for algo in ("said", "stable"))
     expert, planner = returns_of(said / "expert" / "evaluations.npz"), returns_of(said / "evaluations.npz")
-    # The expert is SADR, evaluated as it learns; the planner is evaluated when it has been trained.
-    assert expert == returns_of(sadr / "evaluations.npz") and list(expert) == [100, 200]
+    # The expert is StableSAC, evaluated as it learns; the planner is evaluated when it has been trained.
+    assert expert == returns_of(stable / "evaluations.npz") and list(expert) == [100, 200]
     with np.load(said / "evaluations.npz") as file:
         assert file["answers"].tolist() == ["", "planner"]
     assert list(planner) == [0, 200] and np.isnan(planner[0]).all() and np.isfinite(planner[200]).all()
@@ -62,13 +62,13 @@ def test_the_plots_of_rl_zoo3_show_the_planner(
     monkeypatch.setattr("matplotlib.pyplot.show", lambda: None)
     from rl_zoo3.plots import all_plots
 
-    words = f"all_plots -a sadr said -e {ENV}-delay2 -f {logs} -max {max_steps} --no-display -o {tmp_path / 'out'}"
+    words = f"all_plots -a stable said -e {ENV}-delay2 -f {logs} -max {max_steps} --no-display -o {tmp_path / 'out'}"
     monkeypatch.setattr(sys, "argv", words.split())
     all_plots()
     shown = np.load(tmp_path / "out.pkl", allow_pickle=True)[f"{ENV}-delay2"]
-    (said,), (sadr,) = ((logs / algo).iterdir() for algo in ("said", "sadr"))
+    (said,), (stable,) = ((logs / algo).iterdir() for algo in ("said", "stable"))
     last = 200 if max_steps == 1000 else 100
-    assert shown[f"SADR-{logs}"]["last_evals"] == np.mean(returns_of(sadr / "evaluations.npz")[last])
+    assert shown[f"STABLE-{logs}"]["last_evals"] == np.mean(returns_of(stable / "evaluations.npz")[last])
     # A planner that was trained after the steps shown is not there, and neither is its expert in its place.
     expected = np.mean(returns_of(said / "evaluations.npz")[200 if max_steps == 1000 else 0])
     np.testing.assert_equal(shown[f"SAID-{logs}"]["last_evals"], expected)

@@ -20,7 +20,7 @@ from trained_run import ENV, PLANNER
 from sb3_said import SAID
 from sb3_said.files.archive import load_tree
 from sb3_said.planner.trainer import PlannerTrainer
-from sb3_said.sac import DelayedSAC
+from sb3_said.sac import StableSAC
 from sb3_said.zoo import manager, train
 from sb3_said.zoo.stopping import Stopping
 
@@ -76,7 +76,7 @@ def test_a_signal_to_the_experts_training(
 ) -> None:
     before = signal.getsignal(number)
     with monkeypatch.context() as patch:
-        signal_at(patch, DelayedSAC, "train", 30, number)  # of updates, the first after step 50
+        signal_at(patch, StableSAC, "train", 30, number)  # of updates, the first after step 50
         with pytest.raises(SystemExit) as stop:
             train.main(arguments(tmp_path))
     run = run_of(tmp_path)
@@ -109,8 +109,8 @@ def test_a_signal_to_the_planners_training_loses_no_update(
 
 def test_the_same_again_stops_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
     with monkeypatch.context() as patch:
-        signal_at(patch, DelayedSAC, "train", 30, signal.SIGINT)
-        signal_at(patch, DelayedSAC, "train", 30, signal.SIGTERM)
+        signal_at(patch, StableSAC, "train", 30, signal.SIGINT)
+        signal_at(patch, StableSAC, "train", 30, signal.SIGTERM)
         with pytest.raises(SystemExit) as stop:
             train.main(arguments(tmp_path))
     assert stop.value.code == 130 and "without a checkpoint of this step" in capsys.readouterr().out

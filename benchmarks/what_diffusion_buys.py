@@ -1,0 +1,196 @@
+"""What does diffusion buy? Ways to act under delay that learned from one replay, with as many updates each.
+
+    python benchmarks/what_diffusion_buys.py RUN --updates 8000 --seeds 1 2 3 --delays 0 4 8 16 --json rows.json
+
+RUN is the folder of a SAID run with its checkpoint, which holds the replay; a run that has not ended will do.
+
+expert, last         the expert's actor as it is
+expert, average      the average of its weights
+cloning              a plain network from what is known under delay to the action, weighted as the planner is
+regressed present    such a network for the present, and the expert's actor for age 0 on it
+inpainted present    the planner's present, and the same actor
+one step             SAID in one denoising step
+SAID                 SAID as its preset decides
+weighed              SAID whose critics weigh the candidates of two steps at temperature 1
+paper                SAID with the paper's settings (Tables 3 and 4)
+
+The planner's seed decides its initial weights, its batches and those of the networks. Every row of a seed learns from
+the same batches, but the paper's, which has windows and batches of its own. A call plays what --json lacks, so the same
+command goes on after a stop; the planner of a seed is trained anew if one of its rows is missing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from tqdm import tqdm
+
+from sb3_said import SAID, DelayedObservationWrapper, PlannerConfig
+from sb3_said.evaluation import confidence_interval, rollout
+from sb3_said.files.agents import restore_agent
+from sb3_said.files.archive import load_tree
+from sb3_said.files.atomic import write_json
+from sb3_said.files.checkpoint import CHECKPOINT_NAME
+from sb3_said.offline.belief import BeliefOnly, PlannerBelief
+from sb3_said.planner.trainer import PlannerTrainer
+from sb3_said.zoo.runs import load_run
+
+WEIGHED = {"temperature": 1.0, "sampling_steps": 2, "choice_factor": 1.0}
+EXPERT = ("expert, last", "expert, average")
+LEARNED = ("cloning", "regressed present", "inpainted present", "one step", "SAID", "weighed")
+ROWS = (*EXPERT, *LEARNED, "paper")
+
+
+class Regression:
+    """The plain network that learns beside a planner: a belief of the present, and a policy by itself.
+
+    :param trainer: of the planner
+    :param model: whose actions it gives
+    """
+
+    def __init__(self, trainer: PlannerTrainer, model: SAID):
+        self.network, self.normalizer = trainer.yardstick.requires_grad_(False), trainer.average.normalizer
+        self.model, self.max_delay = model, trainer.planner.max_delay
+
+    def ask(self, state: th.Tensor, action_history: th.Tensor, delay: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Return the present (B, obs_dim) and the action (B, act_dim) in [-1, 1].
+
+        :param action_history: (B, D, act_dim), oldest first; the network reads the d newest as a window has them
+        """
+        rows = th.arange(self.max_delay) + self.max_delay - delay[:, None]  # (B, D)
+        since = action_history.gather(1, rows.clamp(max=self.max_delay - 1)[..., None].expand_as(action_history))
+        present, action = self.network(self.normalizer.normalize_states(state), since, delay)
+        return self.normalizer.denormalize_states(present), action.clamp(-1.0, 1.0)
+
+    def present(self, state: th.Tensor, action_history: th.Tensor, delay: th.Tensor) -> th.Tensor:
+        return self.ask(state, action_history, delay)[0]
+
+    def predict(self, observation: dict[str, np.ndarray], state: Any = None, **_: Any) -> tuple[np.ndarray, Any]:
+        tensors = {key: th.as_tensor(value) for key, value in observation.items()}
+        delay = tensors["delay"][:, 0].long()
+        action = self.ask(tensors["observation"], tensors["action_history"], delay)[1]
+        return self.model.policy.unscale_action(action.numpy()), state
+
+
+def open_run(folder: Path) -> SAID:
+    """Return a run's agent, with the replay of its checkpoint.
+
+    :raises ValueError: for a folder without a checkpoint or a saved SAID agent
+    """
+    agents = [*folder.glob("*-v*.zip"), *folder.glob("expert/best_model.zip")]
+    if not agents or not (folder / CHECKPOINT_NAME).is_file():
+        raise ValueError(f"{folder} has no {CHECKPOINT_NAME}, or no saved agent beside it; give a run of --algo said.")
+    run = load_run(agents[0], device="cpu")
+    model = run.model
+    if not isinstance(model, SAID):
+        raise ValueError(f"{folder} is a run of {type(model).__name__}; give one of --algo said.")
+    state = load_tree(folder / CHECKPOINT_NAME)
+    model.set_env(run.make_env())
+    restore_agent(model, state)
+    model.replay_buffer.load_state_dict(state["replay_buffer"])
+    return model
+
+
+def train(model: SAID, config: PlannerConfig, updates: int, seed: int) -> PlannerTrainer:
+    """Train a planner of these settings on the agent's replay, and hand it over."""
+    model.policy.make_planner(config)
+    model.seed = seed
+    trainer = model.make_planner_trainer(updates)
+    with tqdm(total=updates, desc=f"planner, seed {seed}") as bar:
+        trainer.train(callback=lambda _: bar.update())
+    model.policy.planner_updates.fill_(float(updates))
+    return trainer
+
+
+def players(model: SAID, rows: list[str], args: argparse.Namespace) -> Iterator[tuple[str, int | None, Any]]:
+    """Yield rows, their seed and who plays them; trains what is missing.
+
+    :param rows: missing ones, as "row/seed"
+    """
+    policy = model.policy
+    if "expert, last/None" in rows:
+        with policy.answering("expert"), policy.without_average():
+            yield "expert, last", None, model
+    if "expert, average/None" in rows:
+        with policy.answering("expert"):
+            yield "expert, average", None, model
+    preset = policy.planner.config
+    for seed in args.seeds:
+        if any(f"{row}/{seed}" in rows for row in LEARNED):
+            trainer = train(model, preset, args.updates, seed)
+            regression = Regression(trainer, model)
+            with policy.answering("expert"):
+                yield "cloning", seed, regression
+                yield "regressed present", seed, BeliefOnly(regression, model)
+                yield "inpainted present", seed, BeliefOnly(PlannerBelief(policy.planner), model)
+            for row, how in (("SAID", {}), ("one step", {"sampling_steps": 1}), ("weighed", WEIGHED)):
+                model.set_planner(**how)
+                with policy.answering("planner"):
+                    yield row, seed, model
+        if f"paper/{seed}" in rows:
+            train(model, PlannerConfig.paper(mask=preset.mask, ema_warmup=True), args.updates, seed)
+            with policy.answering("planner"):
+                yield "paper", seed, model
+
+
+def main(argv: list[str] | None = None) -> dict[str, Any]:
+    """Train, play, print, write, and return the numbers."""
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("run", type=Path, metavar="RUN")
+    p.add_argument("--updates", type=int, default=8_000, help="of each planner, and of the networks beside it")
+    p.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3], help="of the planners")
+    p.add_argument("--rows", nargs="+", choices=ROWS, default=list(ROWS), metavar="ROW")
+    p.add_argument("--delays", type=int, nargs="+", default=[0, 4, 8, 16])
+    p.add_argument("--episodes", type=int, default=20, help="of each row, seed and delay")
+    p.add_argument("--n-envs", type=int, default=20)
+    p.add_argument("--eval-seed", type=int, default=10_000, help="reset seed of the first episode")
+    p.add_argument("--num-threads", type=int, default=1)
+    p.add_argument("--json", type=Path, required=True, help="file of the numbers, read and written")
+    args = p.parse_args(argv)
+    th.set_num_threads(args.num_threads)
+    model = open_run(args.run)
+    settings = {"steps": model.num_timesteps, "updates": args.updates, "episodes": args.episodes}
+    document = json.loads(args.json.read_text()) if args.json.exists() else {**settings, "returns": {}}
+    if given := {key: document[key] for key in settings if document[key] != settings[key]}:
+        p.error(f"{args.json} holds results of {given}, but {settings} was asked for: give another --json.")
+    returns: dict[str, dict[str, list[float]]] = document["returns"]
+
+    keys = [f"{row}/{seed}" for row in args.rows for seed in ([None] if row in EXPERT else args.seeds)]
+    missing = [key for key in keys if any(str(d) not in returns.get(key, {}) for d in args.delays)]
+    for row, seed, player in players(model, missing, args):
+        key = f"{row}/{seed}"
+        for delay in args.delays if key in missing else ():
+
+            def make_env(delay: int = delay) -> gym.Env[Any, Any]:
+                return DelayedObservationWrapper(gym.make(model.task or ""), delay, max_delay=model.policy.max_delay)
+
+            if str(delay) not in returns.setdefault(key, {}):
+                played = rollout(player, make_env, args.episodes, args.eval_seed, args.n_envs)
+                returns[key][str(delay)] = played.returns.tolist()
+                write_json(args.json, document)
+    show(returns, args)
+    return document
+
+
+def show(returns: dict[str, dict[str, list[float]]], args: argparse.Namespace) -> None:
+    """Print a Markdown table: intervals over the planners' seeds, over episodes where there is one agent."""
+    print("| return at delay | " + " | ".join(map(str, args.delays)) + " |")
+    print("|---" * (len(args.delays) + 1) + "|")
+    for row in args.rows:
+        seeds = [None] if row in EXPERT else args.seeds
+        texts = []
+        for delay in args.delays:
+            values = np.array([returns[f"{row}/{seed}"][str(delay)] for seed in seeds])  # (n_seeds, n_episodes)
+            texts.append(str(confidence_interval(values if len(values) > 1 else values[0])))
+        print(f"| {row} | " + " | ".join(texts) + " |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,86 @@
+"""benchmarks/what_diffusion_buys.py: every row is played by whom it names, and nothing is played twice."""
+
+import json
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+
+pytest.importorskip("rl_zoo3")
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+
+import what_diffusion_buys as script
+from small_run import ENV, TINY_PLANNER
+
+from sb3_said import SAID, DelayedObservationWrapper
+from sb3_said.evaluation import rollout
+from sb3_said.files.archive import save_tree
+from sb3_said.files.checkpoint import training_state
+from sb3_said.zoo.record import Record
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Return a run that was stopped before its planner was trained, as a checkpoint leaves it."""
+    folder = tmp_path_factory.mktemp("runs") / f"{ENV}-delay0-2-seed0_1"
+    env = DelayedObservationWrapper(gym.make(ENV), (0, 2))
+    kwargs = {"learning_starts": 50, "buffer_size": 500, "planner_kwargs": TINY_PLANNER, "planner_gradient_steps": 1}
+    model = SAID("MlpPolicy", env, seed=0, device="cpu", planner_trial_episodes=0, **kwargs).learn(200)
+    model.policy.planner_updates.zero_()
+    model.save(folder / "expert" / "best_model.zip")
+    save_tree(folder / "checkpoint.zip", training_state(model))
+    Record("said", ENV, 0, [0, 2]).write(folder)
+    return folder
+
+
+def test_rows_are_played_by_whom_they_name(run, tmp_path, monkeypatch, capsys):
+    file = tmp_path / "rows.json"
+    words = [str(run), "--updates", "3", "--delays", "0", "2", "--episodes", "2", "--json", str(file)]
+    tiny = script.PlannerConfig.paper
+    monkeypatch.setattr(script.PlannerConfig, "paper", lambda **kw: tiny(**(TINY_PLANNER | {"n_candidates": 2} | kw)))
+    trained = []
+    original = script.train
+    monkeypatch.setattr(script, "train", lambda *args: trained.append(args[-1]) or original(*args))
+    document = script.main([*words, "--seeds", "1", "2"])
+    out = capsys.readouterr().out
+    returns = document["returns"]
+    assert trained == [1, 1, 2, 2] and json.loads(file.read_text()) == document
+    assert set(returns) == {"expert, last/None", "expert, average/None"} | {
+        f"{row}/{seed}" for row in (*script.LEARNED, "paper") for seed in (1, 2)
+    }
+    assert all(len(returns[key][delay]) == 2 for key in returns for delay in ("0", "2"))
+    assert all(f"| {row} | " in out for row in script.ROWS)
+
+    model = script.open_run(run)
+    make = lambda: DelayedObservationWrapper(gym.make(ENV), 2, max_delay=2)  # noqa: E731
+    average = rollout(model, make, 2, 10_000, 20).returns
+    with model.policy.without_average():
+        last = rollout(model, make, 2, 10_000, 20).returns
+    assert returns["expert, average/None"]["2"] == average.tolist()
+    assert returns["expert, last/None"]["2"] == last.tolist()
+
+    script.main([*words, "--seeds", "1"])
+    assert trained == [1, 1, 2, 2]  # all known
+
+
+def test_the_plain_network_reads_what_the_planner_reads(run):
+    model = script.open_run(run)
+    trainer = script.train(model, model.policy.planner.config, 2, 1)
+    regression = script.Regression(trainer, model)
+    source = model.replay_buffer.window_source()
+    windows = source.gather(th.arange(20), 3)
+    for delay in range(3):
+        ages = th.full((20,), delay)
+        history = th.nn.functional.pad(windows.actions[:, :delay], (0, 0, 2 - delay, 0))
+        present, action = regression.ask(windows.states[:, 0], history, ages)
+        normalizer = trainer.average.normalizer
+        expected = trainer.yardstick(normalizer.normalize_states(windows.states[:, 0]), windows.actions, ages)
+        th.testing.assert_close(present, normalizer.denormalize_states(expected[0]))
+        th.testing.assert_close(action, expected[1].clamp(-1, 1))
+    observation = {"observation": np.zeros((1, 4), np.float32), "action_history": np.zeros((1, 2, 1), np.float32)}
+    answer, _ = regression.predict(observation | {"delay": np.ones((1, 1), np.float32)})
+    assert answer.shape == (1, 1) and np.abs(answer).max() <= model.action_space.high.max()
