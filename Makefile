@@ -48,7 +48,7 @@ type: install
 
 # One thread a worker: the tests' networks are small, and workers that share cores slow each other down.
 pytest: install
-	OMP_NUM_THREADS=1 $(PY) -m pytest -n 2
+	OMP_NUM_THREADS=1 $(PY) -m pytest -n 2 --dist worksteal
 
 format: install
 	$(PY) -m ruff check --fix .

@@ -30,13 +30,13 @@ class ReturnScale(nn.Module):
 
     def update(self, returns: np.ndarray) -> None:
         """Count the running returns of a step, (n_envs,) (Chan et al.'s parallel variance)."""
-        batch = th.as_tensor(returns, dtype=th.float64, device=self.mean.device)
-        difference, total = batch.mean() - self.mean, self.count + len(batch)
-        squares = self.variance * self.count + batch.var(correction=0) * len(batch)
-        self.variance.copy_((squares + difference**2 * self.count * len(batch) / total) / total)
-        self.mean.add_(difference * len(batch) / total)
-        self.count.copy_(total)
-        self.largest.copy_(th.maximum(self.largest, batch.abs().max()))
+        n, count, mean = len(returns), float(self.count), float(self.mean)
+        difference, total = float(np.mean(returns)) - mean, count + n
+        squares = float(self.variance) * count + float(np.var(returns)) * n
+        self.variance.fill_((squares + difference**2 * count * n / total) / total)
+        self.mean.fill_(mean + difference * n / total)
+        self.count.fill_(total)
+        self.largest.fill_(max(float(self.largest), float(np.abs(returns).max())))
 
     @property
     def value(self) -> float:

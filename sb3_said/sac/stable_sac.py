@@ -82,6 +82,8 @@ class StableSAC(DelayedSAC):
             self.policy_kwargs = {**given, "optimizer_kwargs": {"fused": True}}  # Adam: a tenth of an update
         super()._setup_model()
         self.policy_kwargs = given
+        actors = self.actor, self.policy.averaged_actor or self.actor
+        self._running_stats = tuple(get_parameters_by_name(actor, ["running_"]) for actor in actors)  # of a batch norm
 
     def _policy_flags(self) -> dict[str, Any]:
         return {
@@ -119,7 +121,8 @@ class StableSAC(DelayedSAC):
         """Take the statistics of the states in replay, unless they are hardly more than last time."""
         normalizer = self.policy.state_normalizer
         if normalizer is not None and self.num_timesteps >= REFIT_GROWTH * float(normalizer.fitted_at):
-            seen = self.replay_buffer.sample(STATES_LOOKED_AT, env=self._vec_normalize_env).observations
+            n_states = min(STATES_LOOKED_AT, self.replay_buffer.size() * self.n_envs)
+            seen = self.replay_buffer.sample(n_states, env=self._vec_normalize_env).observations
             normalizer.fit(seen[UNDELAYED] if isinstance(seen, dict) else seen, self.num_timesteps)
 
     def _average_actor(self) -> None:
@@ -128,10 +131,8 @@ class StableSAC(DelayedSAC):
             n = self._n_updates // self.policy_delay
             decay = min(self.actor_averaging, 1.0 - 1.0 / n)
             polyak_update(self.actor.parameters(), self.policy.averaged_actor.parameters(), 1.0 - decay)
-            running = [
-                get_parameters_by_name(actor, ["running_"]) for actor in (self.actor, self.policy.averaged_actor)
-            ]
-            polyak_update(running[0], running[1], 1.0)  # of a batch norm
+            own, averaged = self._running_stats
+            polyak_update(own, averaged, 1.0)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Update critics, and every ``policy_delay`` steps actor and entropy coefficient, on batches from replay."""

@@ -274,10 +274,6 @@ class SAIDPolicy(DelayedSACPolicy):
                 obs = arrays if isinstance(space, spaces.Dict) else arrays["observation"]
                 self.predict(obs, deterministic=deterministic)
 
-    def set_training_mode(self, mode: bool) -> None:
-        super().set_training_mode(mode)
-        self.planner.train(mode)
-
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {
             **super()._get_constructor_parameters(),

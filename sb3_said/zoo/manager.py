@@ -19,6 +19,7 @@ from stable_baselines3.common.logger import Logger, make_output_format
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_said import SAID, DelayedSAC, PlannerTrainingCallback, StableSAC
+from sb3_said.files.agents import SafeSaveMixin
 from sb3_said.files.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback, restore_training
 from sb3_said.files.normalization import load_normalization, normalization_file, save_normalization
 from sb3_said.offline import BC, DQL, OfflineAlgorithm
@@ -270,6 +271,7 @@ class DelayedExperimentManager(ExperimentManager):
         return self.checkpointing.save()
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
+        assert isinstance(model, SafeSaveMixin)
         model.task = self.env_name.gym_id  # which environments in other processes do not tell
         super().save_trained_model(model)
         vec_normalize = model.get_vec_normalize_env()

@@ -29,7 +29,7 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / f"{ENV}-delay0-2-seed0_1"
     env = DelayedObservationWrapper(gym.make(ENV), (0, 2))
     kwargs = {"learning_starts": 50, "buffer_size": 500, "planner_kwargs": TINY_PLANNER, "planner_gradient_steps": 1}
-    model = SAID("MlpPolicy", env, seed=0, device="cpu", planner_trial_episodes=0, **kwargs).learn(200)
+    model = SAID("MlpPolicy", env, seed=0, device="cpu", planner_trial_episodes=0, **kwargs).learn(90)
     model.policy.planner_updates.zero_()
     model.save(folder / "expert" / "best_model.zip")
     save_tree(folder / "checkpoint.zip", training_state(model))

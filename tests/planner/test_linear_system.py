@@ -23,7 +23,7 @@ from sb3_said.replay.windows import WindowSource
 
 pytestmark = pytest.mark.slow
 D = 3
-GRADIENT_STEPS = 550
+GRADIENT_STEPS = 400
 
 
 def train(source: WindowSource, **changes) -> PlannerTrainer:

@@ -87,7 +87,7 @@ def test_values_are_in_the_units_of_rewards(task, reward):
     if task == "delayed":
         env = delayed(2)
         env.env = with_rewards(reward)
-    model = make(env, cls=SAID, gamma=0.8, ent_coef=0.0, tau=0.1, learning_rate=1e-2, batch_size=64).learn(300)
+    model = make(env, cls=SAID, gamma=0.8, ent_coef=0.0, tau=0.1, learning_rate=1e-2, batch_size=32).learn(200)
     batch = model.replay_buffer.sample(200)
     states = batch.observations[UNDELAYED] if task == "delayed" else batch.observations
     with th.no_grad():
@@ -106,7 +106,7 @@ def test_what_actor_and_critics_read_of_states():
     th.testing.assert_close(actor[:, :2], (batch["observation"] - normalizer.mean) / normalizer.deviation)
     th.testing.assert_close(critic, (batch[UNDELAYED] - normalizer.mean) / normalizer.deviation)
     seen = model.replay_buffer.observations[: model.replay_buffer.size()].reshape(-1, 2)
-    np.testing.assert_allclose(normalizer.mean, seen.mean(0), atol=0.05)
+    np.testing.assert_allclose(normalizer.mean, seen.mean(0), atol=0.5 * seen.std(0).min())  # of as many, drawn
     th.testing.assert_close(actor[:, -1:], batch["delay"] / 3)  # ages and actions as they are
 
 
@@ -195,9 +195,9 @@ def test_the_average_answers_and_the_actor_collects(tmp_path):
 
 def test_without_its_parts_it_learns_as_delayed_sac():
     """But for the order of an update: so values agree, and no number does exactly."""
-    kwargs = {"gamma": 0.8, "tau": 0.1, "learning_rate": 1e-2, "batch_size": 64}
+    kwargs = {"gamma": 0.8, "tau": 0.1, "learning_rate": 1e-2, "batch_size": 32}
     values = []
-    for model in (make(**AS_SADR, **kwargs).learn(250), make(cls=DelayedSAC, **kwargs).learn(250)):
+    for model in (make(**AS_SADR, **kwargs).learn(160), make(cls=DelayedSAC, **kwargs).learn(160)):
         batch = model.replay_buffer.sample(200)
         with th.no_grad():
             values.append(float(th.cat(model.critic(batch.observations, batch.actions)).mean()))
@@ -213,7 +213,7 @@ def test_it_learns_to_be_where_rewards_are():
 
     env = delayed(2)
     env.env = Near(length=25)
-    model = make(env, gamma=0.9, learning_rate=3e-3, batch_size=64, buffer_size=1500, learning_starts=100).learn(700)
+    model = make(env, gamma=0.9, learning_rate=3e-3, batch_size=64, buffer_size=500, learning_starts=60).learn(420)
     obs, _ = env.reset(seed=5)
     states = []
     for _ in range(25):

@@ -325,8 +325,9 @@ def test_a_killed_training_ends_as_if_it_had_not_been_killed(tmp_path, monkeypat
     assert differ(planner_of(resumed), untrained)
 
 
-@pytest.mark.parametrize("planner_first", [True, False])
-@pytest.mark.parametrize(("save_freq", "killed_at"), [(25, 60), (25, 50), (50, 99)])
+@pytest.mark.parametrize(
+    ("save_freq", "killed_at", "planner_first"), [(25, 60, True), (25, 50, True), (25, 50, False), (50, 99, False)]
+)
 def test_a_resumed_run_loses_and_repeats_no_training(tmp_path, trainings, save_freq, killed_at, planner_first):
     def callbacks():
         both = [TrainingCheckpointCallback(tmp_path, save_freq), PlannerTrainingCallback(folder=tmp_path)]
