@@ -73,7 +73,11 @@ def to_onnx(policy: SAIDPolicy) -> Any:
     x = add("Max", [add("Min", [x, constant(high)]), constant(low)])
     nodes.append(helper.make_node("Identity", [x], ["action"]))
 
-    shapes = {"observation": ["B", obs_dim], "action_history": ["B", max_delay, act_dim], "delay": ["B", 1]}
+    shapes: dict[str, list[str | int | None]] = {
+        "observation": ["B", obs_dim],
+        "action_history": ["B", max_delay, act_dim],
+        "delay": ["B", 1],
+    }
     given = KEYS if student.reader is not None else KEYS[:1]
     inputs = [helper.make_tensor_value_info(key, TensorProto.FLOAT, shapes[key]) for key in given]
     outputs = [helper.make_tensor_value_info("action", TensorProto.FLOAT, ["B", act_dim])]
