@@ -38,7 +38,7 @@ from sb3_said.files.agents import restore_agent
 from sb3_said.files.archive import load_tree
 from sb3_said.files.atomic import write_json
 from sb3_said.files.checkpoint import CHECKPOINT_NAME
-from sb3_said.offline.belief import BeliefOnly, PlannerBelief
+from sb3_said.offline.belief import BeliefOnly, PlannerBelief, as_in_a_window
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.zoo.runs import load_run
 
@@ -62,10 +62,9 @@ class Regression:
     def ask(self, state: th.Tensor, action_history: th.Tensor, delay: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Return the present (B, obs_dim) and the action (B, act_dim) in [-1, 1].
 
-        :param action_history: (B, D, act_dim), oldest first; the network reads the d newest as a window has them
+        :param action_history: (B, D, act_dim), oldest first
         """
-        rows = th.arange(self.max_delay) + self.max_delay - delay[:, None]  # (B, D)
-        since = action_history.gather(1, rows.clamp(max=self.max_delay - 1)[..., None].expand_as(action_history))
+        since = as_in_a_window(action_history, delay)
         present, action = self.network(self.normalizer.normalize_states(state), since, delay)
         return self.normalizer.denormalize_states(present), action.clamp(-1.0, 1.0)
 

@@ -131,6 +131,19 @@ class RolledOutModel(LearnedBelief):
         return (error**2).mean(1)[follows].mean()
 
 
+def as_in_a_window(action_history: th.Tensor, delay: th.Tensor) -> th.Tensor:
+    """Return the actions since an observation as a window has them, a_{t-d} first: (B, D, act_dim).
+
+    What follows the d newest has no meaning; a :class:`RegressionYardstick` looks away from it.
+
+    :param action_history: (B, D, act_dim), oldest first
+    :param delay: (B,) int64 d
+    """
+    max_delay = action_history.shape[1]
+    rows = th.arange(max_delay, device=delay.device) + max_delay - delay[:, None]  # (B, D)
+    return action_history.gather(1, rows.clamp(max=max_delay - 1)[..., None].expand_as(action_history))
+
+
 class RegressedPresent(LearnedBelief):
     """A plain regression from the old state and the actions since to the present.
 
@@ -143,10 +156,7 @@ class RegressedPresent(LearnedBelief):
 
     def present(self, state: th.Tensor, action_history: th.Tensor, delay: th.Tensor) -> th.Tensor:
         """Ask the network once: (B, obs_dim)."""
-        order = th.arange(self.max_delay, device=delay.device) + self.max_delay - delay[:, None]  # (B, D)
-        rows = order.clamp(max=self.max_delay - 1)[..., None].expand(-1, -1, action_history.shape[2])
-        since = action_history.gather(1, rows)  # a_{t-d} first, as in a window; the network looks away from the rest
-        return self.net(self._z(state), since, delay)[0] * self.std + self.mean
+        return self.net(self._z(state), as_in_a_window(action_history, delay), delay)[0] * self.std + self.mean
 
     def loss(self, windows: Windows, generator: th.Generator) -> th.Tensor:
         """Return the error at random ages."""

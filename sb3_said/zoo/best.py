@@ -33,13 +33,7 @@ def write_best(run: Path, folder: Path, planner: dict[str, Any], choice: str) ->
     if (statistics := normalization_file(run / record.agent_name)).exists():
         shutil.copyfile(statistics, normalization_file(folder / record.agent_name))  # of all agents there
 
-    words = ["sb3-said", "train", "--algo", "said", "--env", record.env]
-    for name, delay in (("--delay", record.delay), ("--expert-delay", record.expert_delay)):
-        words += [name, *map(str, delay if isinstance(delay, list) else [delay])] if delay is not None else []
-    if record.dataset:
-        words += ["--dataset", *record.dataset]
-    if record.gym_packages:
-        words += ["--gym-packages", *record.gym_packages]
+    words = ["sb3-said", "train", "--algo", "said", *record.task_words()]
     command = shlex.join([*words, "-conf", str(folder / "best.yml")])
 
     block, left_out = plain_settings(record)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import shlex
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from huggingface_hub import EvalResult, ModelCard, ModelCardData
 from sb3_said.delays.space import written_ages
 from sb3_said.zoo.arguments import explained, make_parser
 from sb3_said.zoo.cells import Cell, Results, average
+from sb3_said.zoo.over_delays import digest_of
 from sb3_said.zoo.record import Record
 from sb3_said.zoo.runs import LoadedRun, load_run, longest_delay
 
@@ -67,7 +67,7 @@ def make_card(run: LoadedRun, record: Record, results: Results, latency_ms: floa
     :raises ValueError: when the results hold nothing of this file
     """
     file = Path(run.info["file"])
-    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    digest = digest_of(run)
     cells = [cell for cell in results.cells if cell.sha256 == digest and cell.result is not None]
     who = run.model.policy.who_answers if hasattr(run.model.policy, "who_answers") else None
     answered = [cell for cell in cells if cell.answer == who and not cell.age_error]
@@ -161,10 +161,7 @@ def control_period(env_id: str) -> str:
 
 def made_by(record: Record) -> str:
     """Return the command that trains such an agent."""
-    delay, steps = record.delay, record.options.get("n_timesteps")
-    words = ["sb3-said train", "--algo", record.algo, "--env", record.env, "--preset", record.preset]
-    if delay is not None:
-        words += ["--delay", *([str(x) for x in delay] if isinstance(delay, list) else [shlex.quote(str(delay))])]
-    if steps and steps > 0:  # rl_zoo3's -1 leaves it to the YAML
-        words += ["-n", str(steps)]
-    return " ".join([*words, "--seed", str(record.seed)])
+    steps = record.options.get("n_timesteps")
+    budget = ["-n", str(steps)] if steps and steps > 0 else []  # rl_zoo3's -1 leaves it to the YAML
+    words = ["sb3-said", "train", "--algo", record.algo, *record.task_words(), "--preset", record.preset, *budget]
+    return shlex.join([*words, "--seed", str(record.seed)])

@@ -70,6 +70,15 @@ class Record:
         """Name of the trained agent's file, as rl_zoo3 gives it."""
         return f"{EnvironmentName(self.env)}.zip"
 
+    def task_words(self) -> list[str]:
+        """Return the words of a command line that name the task: what is played, under which delays, or which logs."""
+        words = ["--env", self.env]
+        for name, delay in (("--delay", self.delay), ("--expert-delay", self.expert_delay)):
+            words += [name, *map(str, delay if isinstance(delay, list) else [delay])] if delay is not None else []
+        for name, values in (("--dataset", self.dataset), ("--gym-packages", self.gym_packages)):
+            words += [name, *values] if values else []
+        return words
+
     def write(self, folder: Path) -> None:
         """Write ``run.json`` into a folder; what it cannot hold is named in it."""
         hyperparams, missing = {}, dict(self.missing)
