@@ -6,6 +6,8 @@ import inspect
 import io
 import pathlib
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 from typing import Any, ClassVar
 
@@ -15,7 +17,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn, Schedule
-from stable_baselines3.common.vec_env import DummyVecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
 from sb3_said.delays.space import ages_of, check_one_max_delay, check_spaces, written_ages
 from sb3_said.files.agents import SafeSaveMixin
@@ -166,6 +168,24 @@ class DelayedSAC(SafeSaveMixin, SAC):
         finally:
             if rollout is None or not rollout.continue_training:
                 self._last_obs = None
+
+    @contextmanager
+    def borrowed_env(self) -> Iterator[VecEnv]:
+        """Hand out the training environment for steps that teach nothing: ``VecNormalize`` keeps its statistics.
+
+        Learning, where it goes on, begins with a new episode.
+        """
+        assert self.env is not None
+        normalizer = self._vec_normalize_env
+        was_training = normalizer is not None and normalizer.training
+        if normalizer is not None:
+            normalizer.training = False
+        try:
+            yield self.env
+        finally:
+            self._last_obs = None  # SB3 then resets the environments
+            if normalizer is not None:
+                normalizer.training = was_training
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Take another environment, as SB3 does; see :meth:`check_ages` for one with another delay.

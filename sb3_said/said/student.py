@@ -189,23 +189,14 @@ def _replayed(model: SAID, config: Distillation, generator: th.Generator) -> _Ro
 
 
 def _visited(model: SAID, who: str, n_steps: int) -> _Rows:
-    """Play the training environment, and label where that leads. It starts a new episode afterwards."""
-    env, normalizer = model.get_env(), model.get_vec_normalize_env()
-    was_training = normalizer is not None and normalizer.training
-    if normalizer is not None:
-        normalizer.training = False
+    """Play the training environment, and label where that leads."""
     visited: list[dict[str, th.Tensor]] = []
-    try:
-        with model.policy.answering(who):
-            obs = env.reset()
-            for _ in range(-(-n_steps // env.num_envs)):
-                given = model.policy.obs_to_tensor(obs)[0]
-                visited.append(given if isinstance(given, dict) else _undelayed(given, model.policy.planner.act_dim))
-                obs = env.step(model.predict(obs, deterministic=True)[0])[0]
-    finally:
-        model._last_obs = None  # SB3 then resets the environments
-        if normalizer is not None:
-            normalizer.training = was_training
+    with model.borrowed_env() as env, model.policy.answering(who):
+        obs: Any = env.reset()
+        for _ in range(-(-n_steps // env.num_envs)):
+            given = model.policy.obs_to_tensor(obs)[0]
+            visited.append(given if isinstance(given, dict) else _undelayed(given, model.policy.planner.act_dim))
+            obs = env.step(model.predict(obs, deterministic=True)[0])[0]
     parts = {key: th.cat([each[key] for each in visited]) for key in KEYS}
     return _labelled(model, parts, th.full_like(parts["observation"], th.nan))
 

@@ -18,20 +18,15 @@ RIVALS: tuple[Answer, ...] = ("planner", "expert")
 def play_trial(model: SAID, n_episodes: int, progress_bar: bool = False) -> dict[Answer, np.ndarray]:
     """Play the training environment with the planner and with the expert, from the same seed.
 
-    These are environment steps beyond those of ``learn``. It starts a new episode afterwards.
+    These are environment steps beyond those of ``learn``.
 
     :param model: with a trained planner and an environment
     :param n_episodes: for each of the two
     :param progress_bar: show one
     :return: for each, (n_episodes,) undiscounted returns in the task's own rewards
     """
-    env, normalizer = model.get_env(), model.get_vec_normalize_env()
-    assert env is not None
-    seed, was_training = int(np.random.randint(2**31)), normalizer is not None and normalizer.training
-    if normalizer is not None:
-        normalizer.training = False
-    returns: dict[Answer, np.ndarray] = {}
-    try:
+    seed, returns = int(np.random.randint(2**31)), {}
+    with model.borrowed_env() as env:
         for who in RIVALS:
             with model.policy.answering(who), tqdm(total=n_episodes, desc=who, disable=not progress_bar) as bar:
 
@@ -42,10 +37,6 @@ def play_trial(model: SAID, n_episodes: int, progress_bar: bool = False) -> dict
                 played = evaluate_policy(model, env, n_episodes, callback=show, return_episode_rewards=True, warn=False)
                 show({"episode_rewards": played[0]}, {})
                 returns[who] = np.asarray(played[0])
-    finally:
-        model._last_obs = None  # SB3 then resets the environments
-        if normalizer is not None:
-            normalizer.training = was_training
     return returns
 
 

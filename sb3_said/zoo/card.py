@@ -6,7 +6,6 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from huggingface_hub import EvalResult, ModelCard, ModelCardData
 
@@ -15,7 +14,7 @@ from sb3_said.zoo.arguments import explained, make_parser
 from sb3_said.zoo.cells import Cell, Results, average
 from sb3_said.zoo.over_delays import digest_of
 from sb3_said.zoo.record import Record
-from sb3_said.zoo.runs import LoadedRun, load_run, longest_delay
+from sb3_said.zoo.runs import LoadedRun, control_period, load_run, longest_delay
 
 EPILOG = """\
 examples:
@@ -108,13 +107,14 @@ def describe(
     latency_ms: float | None,
 ) -> str:
     """Return the card's text: how to use it, how it was made, and what it returned."""
-    file, env_id = Path(run.info["file"]), run.info["env"]
+    file = Path(run.info["file"])
     kind = type(run.model).__name__
     n_episodes, seed = results.settings["n_episodes"], results.settings["seed"]
+    period = control_period(run)
     facts: dict[str, Any] = {
         "ages trained on": written_ages(run.model.trained_ages or []) + " control steps",  # type: ignore[attr-defined]
         "largest age it reads": f"{longest_delay(run.model) or 0} control steps",
-        "control period": control_period(env_id),
+        "control period": "unknown" if period is None else f"{1000 * period:g} ms",
         "who answers": answered[0].answer or kind,
         "environment steps": f"{run.model.num_timesteps:,}",
         "training seed": record.seed,
@@ -149,14 +149,6 @@ def describe(
             texts.append(average({column: np.array(found[0]["returns"])}, [column])[0] if found and found[0] else "-")
         lines.append(f"| {column} | " + " | ".join(texts) + " |")
     return "\n".join(lines)
-
-
-def control_period(env_id: str) -> str:
-    """Return the time of a control step of a task, as far as it says."""
-    env = gym.make(env_id)
-    seconds = getattr(env.unwrapped, "dt", None) or 1 / float(env.metadata.get("render_fps") or np.inf)
-    env.close()
-    return f"{1000 * seconds:g} ms" if seconds else "unknown"
 
 
 def made_by(record: Record) -> str:

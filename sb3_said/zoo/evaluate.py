@@ -15,8 +15,8 @@ from sb3_said.evaluation import Summary, collect_observations, measure_latency, 
 from sb3_said.files.atomic import write_json
 from sb3_said.offline import normalized_score, reference_returns
 from sb3_said.zoo.arguments import TRUST, add_run, check_positive, explained, make_parser, read_delay
-from sb3_said.zoo.latency import control_period, evaluate_in_real_time
-from sb3_said.zoo.runs import LoadedRun, answering, answers, load_run, origin
+from sb3_said.zoo.latency import evaluate_in_real_time
+from sb3_said.zoo.runs import LoadedRun, answering, answers, control_period, load_run, origin
 
 EPILOG = f"""\
 examples:
@@ -72,7 +72,9 @@ def main(argv: list[str] | None = None) -> None:
             runs["best"] = load_run(best, *how_played)
             if runs["best"].info["trained_steps"] == run.info["trained_steps"]:
                 del runs["best"]  # the last one is the best
-        period = control_period(run) if args.realtime and args.period is None else args.period
+        period: float = args.period or (args.realtime and control_period(run)) or 0.0
+        if args.realtime and not period:
+            raise ValueError(f"{run.info['env']} does not tell how long a control step is: give --period.")
 
     last_seed = args.seed + args.episodes - 1
     print(f"{run.info['algo']} on {run.info['env']}, delay {run.info['delay']}, reset seeds {args.seed}..{last_seed}")

@@ -15,20 +15,6 @@ from sb3_said.zoo.runs import LoadedRun, answering
 REAL_TIME = {"in real time": True, "latency ignored": False}
 
 
-def control_period(run: LoadedRun) -> float:
-    """Return the control step of a simulated robot, in seconds.
-
-    :raises ValueError: for a task that does not tell
-    """
-    env = run.make_env()
-    try:
-        return float(env.unwrapped.dt)  # type: ignore[attr-defined]  # of MuJoCo tasks
-    except AttributeError as error:
-        raise ValueError(f"{run.info['env']} does not tell how long a control step is: give --period.") from error
-    finally:
-        env.close()
-
-
 def evaluate_in_real_time(
     run: LoadedRun, answer: str | None, n_episodes: int, seed: int, period: float, deterministic: bool = True
 ) -> list[tuple[Summary, dict[str, Any]]]:

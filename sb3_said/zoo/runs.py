@@ -204,6 +204,15 @@ def longest_delay(model: BaseAlgorithm) -> int | None:
     return int(space["action_history"].shape[0])  # type: ignore[index]  # a Box has a shape
 
 
+def control_period(run: LoadedRun) -> float | None:
+    """Return the control step of a simulated robot, in seconds; None where the task does not tell, as MuJoCo's do."""
+    env = run.make_env()
+    try:
+        return getattr(env.unwrapped, "dt", None)
+    finally:
+        env.close()
+
+
 def origin(run: LoadedRun) -> dict[str, Any]:
     """Say what a reader needs to judge and repeat the numbers: command, date, machine, versions."""
     program = sys.argv[0] if sys.argv[0].startswith("sb3-said ") else f"python {sys.argv[0]}"

@@ -19,9 +19,9 @@ from small_run import ENV, TINY_PLANNER, write_run
 
 from sb3_said import SAID, DelayedObservationWrapper
 from sb3_said.evaluation import rollout
-from sb3_said.zoo import enjoy, evaluate, latency
+from sb3_said.zoo import enjoy, evaluate
 from sb3_said.zoo.record import Record
-from sb3_said.zoo.runs import load_run
+from sb3_said.zoo.runs import control_period, load_run
 
 
 @pytest.fixture(scope="module")
@@ -95,12 +95,16 @@ def test_evaluate_in_real_time(
     assert "expert, latency ignored: " in out and "age_p99 0" in out
 
 
-def test_the_period_is_the_tasks_own_where_it_tells(run: Path) -> None:
+def test_the_period_is_the_tasks_own_where_it_tells(
+    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     loaded = load_run(run, device="cpu")
-    assert latency.control_period(loaded) == gym.make(ENV).unwrapped.dt  # type: ignore[attr-defined]
-    silent = replace(loaded, make_env=lambda: gym.make("MountainCarContinuous-v0"), info={"env": "MountainCar"})
-    with pytest.raises(ValueError, match="give --period"):
-        latency.control_period(silent)
+    assert control_period(loaded) == gym.make(ENV).unwrapped.dt  # type: ignore[attr-defined]
+    assert control_period(replace(loaded, make_env=lambda: gym.make("MountainCarContinuous-v0"))) is None
+    monkeypatch.setattr(evaluate, "control_period", lambda run: None)
+    with pytest.raises(SystemExit):
+        evaluate.main([str(run), "--realtime", "--episodes", "1", "--device", "cpu"])
+    assert "give --period" in capsys.readouterr().err
 
 
 def test_a_shorter_delay_keeps_the_length_of_the_action_history(run: Path) -> None:
