@@ -1,0 +1,89 @@
+"""How steady trainings are: their evaluations in the last steps, over seeds.
+
+    python benchmarks/steadiness.py stable=logs/said/Hopper-v5-delay0-16-seed1_1 stable=...seed2_1 sadr=logs/sadr/... \\
+        --json steadiness.json
+
+Runs of one name are seeds of the same training: folders, or files written by --json, whose runs of that name count. Of
+a SAID run its expert's evaluations are read. A training that has not ended counts up to where it is.
+
+mean        of all evaluations in the last steps, over runs
+sd / mean   standard deviation between the evaluations of one run, over their mean; the worst run's
+bad         evaluations below 70 % of their run's median
+worst run   its mean over the mean of all runs
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_said.files.atomic import write_json
+
+BAD = 0.7  # of the median, as results/stable_expert.md counts
+EVALUATIONS = "evaluations.npz"  # of SB3's EvalCallback
+
+
+def read_runs(name: str, path: Path) -> list[dict[str, Any]]:
+    """Return the evaluations that a path holds: steps (n,) and returns (n, n_episodes) each.
+
+    :raises ValueError: where it holds none
+    """
+    if path.is_file():
+        return [run for run in json.loads(path.read_text()) if run["name"] == name]
+    files = [file for file in (path / EVALUATIONS, path / "expert" / EVALUATIONS) if file.is_file()]
+    if not files:
+        raise ValueError(f"{path} has no {EVALUATIONS}; train with --eval-freq.")
+    with np.load(files[-1]) as saved:  # a SAID run's expert has its own
+        steps, returns = saved["timesteps"].tolist(), saved["results"].round(1).tolist()
+    return [{"name": name, "run": path.name, "steps": steps, "returns": returns}]
+
+
+def steadiness(runs: list[dict[str, Any]], last: int) -> dict[str, Any]:
+    """Return the columns of a row.
+
+    :param last: environment steps before a run's end from which on its evaluations count
+    """
+    means = [np.mean(run["returns"], axis=1)[np.array(run["steps"]) > run["steps"][-1] - last] for run in runs]
+    of_runs = np.array([late.mean() for late in means])
+    return {
+        "runs": len(runs),
+        "steps": [run["steps"][-1] for run in runs],
+        "mean": float(of_runs.mean()),
+        "sd / mean": max(float(late.std() / late.mean()) for late in means),
+        "bad": sum(int((late < BAD * np.median(late)).sum()) for late in means),
+        "evaluations": sum(map(len, means)),
+        "worst run": float(of_runs.min() / of_runs.mean()),
+    }
+
+
+def main(argv: list[str] | None = None) -> dict[str, dict[str, Any]]:
+    """Print a Markdown table, write the evaluations, and return the rows."""
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("runs", nargs="+", metavar="NAME=RUN_OR_JSON")
+    p.add_argument("--last", type=int, default=100_000, metavar="STEPS", help="of each run (default: 100000)")
+    p.add_argument("--json", type=Path, help="write every evaluation there, to read again")
+    args = p.parse_args(argv)
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for word in args.runs:
+        name, _, path = word.rpartition("=")
+        try:
+            groups.setdefault(name, []).extend(read_runs(name, Path(path)))
+        except ValueError as error:
+            p.error(str(error))
+    rows = {name: steadiness(runs, args.last) for name, runs in groups.items()}
+    print("| | steps | mean | sd / mean, worst run | bad evaluations | worst run / mean |\n|---|---|---|---|---|---|")
+    for name, row in rows.items():
+        steps = ", ".join(f"{n:,}" for n in row["steps"])
+        print(f"| {name} | {steps} | {row['mean']:,.0f} | {row['sd / mean']:.2f} | {row['bad']} of "
+              f"{row['evaluations']} | {row['worst run']:.2f} |")  # fmt: skip
+    if args.json is not None:
+        write_json(args.json, [run for runs in groups.values() for run in runs])
+    return rows
+
+
+if __name__ == "__main__":
+    main()
