@@ -79,7 +79,7 @@ class Regression:
 
 
 def open_run(folder: Path) -> SAID:
-    """Return a run's agent, with the replay of its checkpoint.
+    """Return a run's agent with the replay of its checkpoint; of a run that has not ended, the checkpoint's agent.
 
     :raises ValueError: for a folder without a checkpoint or a saved SAID agent
     """
@@ -92,7 +92,8 @@ def open_run(folder: Path) -> SAID:
         raise ValueError(f"{folder} is a run of {type(model).__name__}; give one of --algo said.")
     state = load_tree(folder / CHECKPOINT_NAME)
     model.set_env(run.make_env())
-    restore_agent(model, state)
+    if model.num_timesteps < state["counters"]["num_timesteps"]:
+        restore_agent(model, state)
     model.replay_buffer.load_state_dict(state["replay_buffer"])
     return model
 

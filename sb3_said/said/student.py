@@ -124,7 +124,7 @@ def distill(model: SAID, config: Distillation) -> float:
         parts = [_replayed(model, config, generator) for _ in range(-(-config.n_labels // LABELLED_AT_ONCE))]
         rows = sum(parts[1:], parts[0])[: config.n_labels]
     else:
-        rows = _visited(model, "planner", config.n_labels)
+        rows = _visited(model, "planner", config.n_labels, generator)
     n_held_out = int(HELD_OUT * len(rows.inputs))
     held_out, rows = rows[:n_held_out], rows[n_held_out:]
     student.fit(rows.inputs)
@@ -133,7 +133,7 @@ def distill(model: SAID, config: Distillation) -> float:
     rounds = config.rounds if model.env is not None and config.own_steps > 0 else 0
     for k in range(config.gradient_steps):
         if k > 0 and rounds and k % -(-config.gradient_steps // (rounds + 1)) == 0:
-            rows = rows + _visited(model, "student", -(-config.own_steps // rounds))
+            rows = rows + _visited(model, "student", -(-config.own_steps // rounds), generator)
         drawn = th.randint(len(rows.inputs), (config.batch_size,), generator=generator).to(rows.inputs.device)
         loss = _loss(model, rows[drawn], config.q_weight)
         optimizer.zero_grad()
@@ -188,10 +188,11 @@ def _replayed(model: SAID, config: Distillation, generator: th.Generator) -> _Ro
     return _labelled(model, {key: part.to(device) for key, part in parts.items()}, presents.to(device))
 
 
-def _visited(model: SAID, who: str, n_steps: int) -> _Rows:
+def _visited(model: SAID, who: str, n_steps: int, generator: th.Generator) -> _Rows:
     """Play the training environment, and label where that leads."""
     visited: list[dict[str, th.Tensor]] = []
     with model.borrowed_env() as env, model.policy.answering(who):
+        env.seed(int(th.randint(2**31, (), generator=generator)))
         obs: Any = env.reset()
         for _ in range(-(-n_steps // env.num_envs)):
             given = model.policy.obs_to_tensor(obs)[0]

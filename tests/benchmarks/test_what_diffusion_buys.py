@@ -31,8 +31,11 @@ def run(tmp_path_factory):
     kwargs = {"learning_starts": 50, "buffer_size": 500, "planner_kwargs": TINY_PLANNER, "planner_gradient_steps": 1}
     model = SAID("MlpPolicy", env, seed=0, device="cpu", planner_trial_episodes=0, **kwargs).learn(90)
     model.policy.planner_updates.zero_()
-    model.save(folder / "expert" / "best_model.zip")
     save_tree(folder / "checkpoint.zip", training_state(model))
+    model.num_timesteps = 60
+    with th.no_grad():
+        model.actor.mu.bias.fill_(1.0)
+    model.save(folder / "expert" / "best_model.zip")
     Record("said", ENV, 0, [0, 2]).write(folder)
     return folder
 
@@ -65,6 +68,11 @@ def test_rows_are_played_by_whom_they_name(run, tmp_path, monkeypatch, capsys):
 
     script.main([*words, "--seeds", "1"])
     assert trained == [1, 1, 2, 2]  # all known
+
+
+def test_of_a_run_that_has_not_ended_the_checkpoint_counts(run):
+    model = script.open_run(run)
+    assert model.num_timesteps == 90 and model.replay_buffer.size() == 90 and model.actor.mu.bias.item() != 1.0
 
 
 def test_the_plain_network_reads_what_the_planner_reads(run):

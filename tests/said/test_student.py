@@ -103,10 +103,15 @@ def test_a_file_keeps_it_and_who_answers(taught, tmp_path):
 
 def test_it_learns_where_it_goes_itself(pupil, monkeypatch):
     visits, visited = [], student_module._visited
-    monkeypatch.setattr(student_module, "_visited", lambda m, who, n: visits.append((who, n)) or visited(m, who, n))
+
+    def recorded(model, who, n_steps, generator):
+        visits.append((who, n_steps))
+        return visited(model, who, n_steps, generator)
+
+    monkeypatch.setattr(student_module, "_visited", recorded)
     pupil.distill(**{**QUICK, "n_labels": 100, "gradient_steps": 30})
     assert visits == [("student", 30), ("student", 30)]
-    rows = visited(pupil, "student", 30)
+    rows = visited(pupil, "student", 30, th.Generator())
     assert rows.inputs.shape == (30, 2 + 2 + 1) and rows.presents.isnan().all()
     with th.no_grad():  # in Drift the action moves the first entry of the state, and is the last of the next history
         states, history = rows.inputs[:, :2], rows.inputs[:, 2:4]

@@ -8,15 +8,26 @@ from typing import Any
 import gymnasium as gym
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
+from sb3_said.files.archive import save_tree
+from sb3_said.files.checkpoint import CHECKPOINT_NAME, training_state
 from sb3_said.zoo.record import Record
 
 ENV = "InvertedPendulum-v5"
 TINY_PLANNER = {"depth": 1, "d_model": 32, "horizon": 4, "sampling_steps": 2, "n_candidates": 2}
 
 
-def write_run(folder: Path, cls: type[DelayedSAC], delay: int, steps: int = 60, seed: int = 0, **kwargs: Any) -> Path:
+def write_run(
+    folder: Path,
+    cls: type[DelayedSAC],
+    delay: int | tuple[int, int],
+    steps: int = 60,
+    seed: int = 0,
+    checkpoint: bool = False,
+    **kwargs: Any,
+) -> Path:
     """Train an agent on ``ENV`` and leave its run folder.
 
+    :param checkpoint: leave one, too, of its end
     :param kwargs: of the agent
     """
     if cls is SAID:
@@ -25,5 +36,8 @@ def write_run(folder: Path, cls: type[DelayedSAC], delay: int, steps: int = 60, 
     model = cls("MultiInputPolicy", DelayedObservationWrapper(gym.make(ENV), delay), seed=seed, **kwargs)
     model.learn(steps)
     model.save(folder / f"{ENV}.zip")
-    Record("said" if cls is SAID else "sadr", ENV, seed, delay).write(folder)
+    if checkpoint:
+        save_tree(folder / CHECKPOINT_NAME, training_state(model))
+    written = delay if isinstance(delay, int) else list(delay)
+    Record("said" if cls is SAID else "sadr", ENV, seed, written).write(folder)
     return folder

@@ -1,0 +1,102 @@
+"""What a student keeps of its planner, and how fast it answers.
+
+    python benchmarks/distillation.py RUN --seeds 1 2 --q-weights 0 0.1 --delays 0 4 8 16 --json distillation.json
+
+RUN is the folder of a SAID run that has ended, with its checkpoint, which holds the replay. Each student learns from
+the planner at temperature 0, as model.distill() does by itself. "kept" is its mean return over the planner's, all
+delays together. Times are of single answers on one thread: of predict(), and of the exported graph (--onnx).
+A call plays what --json lacks, so the same command goes on after a stop.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from what_diffusion_buys import open_run
+
+from sb3_said import SAID, DelayedObservationWrapper
+from sb3_said.evaluation import collect_observations, confidence_interval, measure_latency, rollout
+from sb3_said.files.atomic import write_json
+from sb3_said.realtime import OnnxModel
+from sb3_said.said.export import export
+
+
+def play(model: SAID, args: argparse.Namespace) -> dict[str, Any]:
+    """Return an agent's returns by delay, and the time of its answers at the longest."""
+    found: dict[str, Any] = {"returns": {}}
+    for delay in args.delays:
+
+        def make_env(delay: int = delay) -> gym.Env[Any, Any]:
+            return DelayedObservationWrapper(gym.make(model.task or ""), delay, max_delay=model.policy.max_delay)
+
+        played = rollout(model, make_env, args.episodes, args.eval_seed, args.n_envs)
+        found["returns"][str(delay)] = played.returns.tolist()
+    met = collect_observations(make_env, 100, args.eval_seed)
+    found["predict"] = vars(measure_latency(model, met, args.calls))
+    if args.onnx and model.policy.who_answers == "student":
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "student.onnx"
+            export(model.policy, file)
+            found["onnx"] = vars(measure_latency(OnnxModel(file), met, args.calls))
+    return found
+
+
+def main(argv: list[str] | None = None) -> dict[str, Any]:
+    """Distil, play, print, write, and return the numbers."""
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("run", type=Path, metavar="RUN")
+    p.add_argument("--seeds", type=int, nargs="+", default=[1], help="of the students")
+    p.add_argument("--q-weights", type=float, nargs="+", default=[0.0, 0.1], help="of -min Q(s, a) in the loss")
+    p.add_argument("--settings", type=json.loads, default={}, metavar="JSON", help="other settings of distill()")
+    p.add_argument("--delays", type=int, nargs="+", default=[0, 4, 8, 16])
+    p.add_argument("--episodes", type=int, default=20, help="of each agent and delay")
+    p.add_argument("--n-envs", type=int, default=20)
+    p.add_argument("--eval-seed", type=int, default=10_000, help="reset seed of the first episode")
+    p.add_argument("--calls", type=int, default=2_000, help="answers to time")
+    p.add_argument("--onnx", action="store_true", help="time the exported graph, too: needs sb3_said[export]")
+    p.add_argument("--num-threads", type=int, default=1)
+    p.add_argument("--json", type=Path, required=True, help="file of the numbers, read and written")
+    args = p.parse_args(argv)
+    th.set_num_threads(args.num_threads)
+    rows: dict[str, Any] = json.loads(args.json.read_text()) if args.json.exists() else {}
+    model = open_run(args.run)
+    model.set_planner(temperature=0.0)
+    if "planner" not in rows:
+        with model.policy.answering("planner"):
+            rows["planner"] = play(model, args)
+        write_json(args.json, rows)
+    for seed in args.seeds:
+        for q_weight in args.q_weights:
+            name = f"student, q_weight {q_weight:g}, seed {seed}"
+            if name not in rows:
+                model.seed = seed
+                error = model.distill(q_weight=q_weight, **args.settings)
+                with model.policy.answering("student"):
+                    rows[name] = play(model, args) | {"error": error}
+                write_json(args.json, rows)
+    show(rows)
+    return rows
+
+
+def show(rows: dict[str, Any]) -> None:
+    """Print a Markdown table."""
+    delays = list(rows["planner"]["returns"])
+    print("| | " + " | ".join(f"delay {d}" for d in delays) + " | kept | predict p50, p99 ms | ONNX p50, p99 ms |")
+    print("|---" * (len(delays) + 4) + "|")
+    whole = np.mean([rows["planner"]["returns"][d] for d in delays])
+    for name, row in rows.items():
+        texts = [str(confidence_interval(row["returns"][d])) for d in delays]
+        kept = np.mean([row["returns"][d] for d in delays]) / whole
+        times = [f"{row[k]['p50_ms']:.2f}, {row[k]['p99_ms']:.2f}" if k in row else "-" for k in ("predict", "onnx")]
+        print(f"| {name} | " + " | ".join(texts) + f" | {kept:.3f} | " + " | ".join(times) + " |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,41 @@
+"""benchmarks/distillation.py: what it writes is what a student of the run does."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rl_zoo3")
+pytest.importorskip("onnxruntime")
+
+import distillation as script
+from small_run import write_run
+from what_diffusion_buys import open_run
+
+from sb3_said import SAID
+from sb3_said.evaluation import rollout
+from sb3_said.zoo.runs import load_run
+
+TINY = {"n_labels": 40, "own_steps": 10, "rounds": 1, "gradient_steps": 5, "batch_size": 8}
+
+
+def test_students_are_played_beside_their_planner(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run, file = write_run(tmp_path / "run-v0", SAID, (0, 2), 90, checkpoint=True), tmp_path / "distillation.json"
+    words = [str(run), "--settings", json.dumps(TINY), "--delays", "0", "2", "--episodes", "2", "--calls", "3", 
+             "--onnx", "--json", str(file)]  # fmt: skip
+    rows = script.main([*words, "--seeds", "5", "--q-weights", "0.5"])
+    name = "student, q_weight 0.5, seed 5"
+    assert set(rows) == {"planner", name} and json.loads(file.read_text()) == rows
+    assert rows[name]["error"] > 0 and rows[name]["onnx"]["n_calls"] == rows["planner"]["predict"]["n_calls"] == 3
+    out = capsys.readouterr().out
+    assert f"| {name} | " in out and "| planner | " in out
+
+    model = open_run(run)
+    model.seed = 5
+    assert model.distill(q_weight=0.5, **TINY) == rows[name]["error"]
+    make_env = load_run(run, delay=2, device="cpu").make_env
+    for who, row in (("planner", "planner"), ("student", name)):
+        with model.policy.answering(who):
+            assert rollout(model, make_env, 2, 10_000, 20).returns.tolist() == rows[row]["returns"]["2"]
+
+    assert script.main([*words, "--seeds", "5", "--q-weights", "0.5"]) == rows
