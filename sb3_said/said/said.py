@@ -27,7 +27,7 @@ from sb3_said.said.callbacks import PlannerTrainingCallback
 from sb3_said.said.policies import Answer, SAIDPolicy, Value
 from sb3_said.said.student import Distillation, distill
 from sb3_said.said.training import PlannerTraining
-from sb3_said.said.trial import let_the_better_answer
+from sb3_said.said.trial import let_the_best_answer, ways_of
 
 HELD_OUT = 0.05  # of the planner's data
 HAND_OVER_INTERVAL = 100  # updates of an offline training
@@ -40,9 +40,9 @@ class SAID(OfflineAlgorithm, StableSAC):
 
     ``learn`` runs the expert (:class:`~sb3_said.sac.StableSAC`), then trains a diffusion transformer on windows of its
     replay buffer. ``predict`` asks the expert until the planner is trained, and then whoever of the two does better in
-    a few episodes. The planner inpaints what the delay hides and the plan behind it; at a temperature above 0 many
-    times, and the critics choose. Collection always uses the expert. ``learn_offline`` trains the planner on logs
-    instead, without an expert.
+    a few episodes, which also tell how the planner decides best. The planner inpaints what the delay hides and the plan
+    behind it; at a temperature above 0 many times, and the critics choose. Collection always uses the expert.
+    ``learn_offline`` trains the planner on logs instead, without an expert.
 
     :param policy: ``"MultiInputPolicy"`` or ``"MlpPolicy"``, which name the same class
     :param env: a task in a ``DelayedObservationWrapper``, or one with a 1-D Box observation (delay 0)
@@ -55,8 +55,11 @@ class SAID(OfflineAlgorithm, StableSAC):
     :param planner_terminal_penalty: replaces the reward of a terminating step in the values that weigh windows. The
         paper's Table 3 has -100, for tasks that end by falling, and the presets of such tasks have it too; None keeps
         the reward, for tasks that may end because they are done
-    :param planner_trial_episodes: of the training environment, played with the planner after its training and as many
-        with the expert; the better one answers. They come on top of ``learn``'s steps. 0: the planner answers
+    :param planner_trial_episodes: of the training environment, played after the planner's training in each of its ways
+        to decide, and as many with the expert; the best one answers. They come on top of ``learn``'s steps. 0: the
+        planner answers, as ``planner_kwargs`` says
+    :param planner_ways: names and settings of :meth:`set_planner` to compare with those of ``planner_kwargs``; by
+        default :data:`~sb3_said.said.trial.WAYS`, or none where ``planner_kwargs`` has such settings
     :param value: who scores the planner's candidates: ``"critics"``, the expert's, by min Q(s, a); or ``"iql"``, a
         V(s) that is learned beside the planner by implicit Q-learning, which is what offline learning has
     :param student_width: of the hidden layers of the student that :meth:`distill` trains; None before
@@ -80,7 +83,8 @@ class SAID(OfflineAlgorithm, StableSAC):
         planner_train_freq: int | None = None,
         planner_newest_fraction: float = 0.2,
         planner_terminal_penalty: float | None = None,
-        planner_trial_episodes: int = 5,
+        planner_trial_episodes: int = 10,
+        planner_ways: dict[str, dict[str, Any]] | None = None,
         value: Value = "critics",
         student_width: int | None = None,
         **sac_kwargs: Any,
@@ -100,6 +104,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         self.planner_newest_fraction = planner_newest_fraction
         self.planner_terminal_penalty = planner_terminal_penalty
         self.planner_trial_episodes = planner_trial_episodes
+        self.planner_ways = ways_of(planner_ways, self._given_planner_kwargs)
         self.value = value
         self.student_width = student_width
         self._planner_trained_at = 0  # num_timesteps of the last planner training
@@ -318,7 +323,7 @@ class SAID(OfflineAlgorithm, StableSAC):
             self.set_answer("planner")
             n_episodes = self.planner_trial_episodes if trial_episodes is None else trial_episodes
             if outcome == "done" and n_episodes > 0 and self.env is not None:
-                training.log(let_the_better_answer(self, n_episodes, progress_bar))
+                training.log(let_the_best_answer(self, n_episodes, progress_bar))
         if outcome == "stopped":
             raise KeyboardInterrupt
         self._planner_trained_at = self.num_timesteps

@@ -20,7 +20,6 @@ from sb3_said import SAID
 from sb3_said.evaluation import Latency, Summary
 from sb3_said.files.atomic import write_json
 from sb3_said.files.checkpoint import CHECKPOINT_NAME
-from sb3_said.said.trial import RIVALS
 from sb3_said.zoo.arguments import TRUST, check_positive, explained, make_parser
 from sb3_said.zoo.best import write_best
 from sb3_said.zoo.depths import DepthPlanners
@@ -191,7 +190,7 @@ def report(args: argparse.Namespace, run: LoadedRun, study: Study, winner: Froze
         how = (args.report_episodes, args.report_seed)
         played = [
             evaluate(run, answer, *how, latency_calls=100).to_dict()
-            for answer in RIVALS
+            for answer in ("planner", "expert")
             if answer in answers(run.model)
         ]
     run.model.save(folder / "best.zip")

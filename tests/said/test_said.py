@@ -186,6 +186,7 @@ def test_every_argument_has_a_default_and_is_an_attribute():
         "planner_newest_fraction": 0.3,
         "planner_terminal_penalty": None,
         "planner_trial_episodes": 3,
+        "planner_ways": {"eager": {"temperature": 0.1}},
         "value": "iql",
         "student_width": 16,
     }

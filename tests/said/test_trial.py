@@ -18,7 +18,7 @@ from sb3_said.said import trial
 
 
 def rigged(monkeypatch, planner, expert):
-    played = {"planner": np.array(planner), "expert": np.array(expert)}
+    played = {"planner": np.array(planner), "expert": np.array(expert)}, 7
     monkeypatch.setattr(trial, "play_trial", lambda *_: played)
 
 
@@ -28,21 +28,52 @@ def pendulum():
 
 @pytest.fixture(scope="module")
 def trained():
-    return make(env=pendulum()).learn(60)
+    return make(env=pendulum(), planner_ways=trial.WAYS).learn(60)
 
 
 def test_returns_are_those_of_each_who_can_answer(trained):
+    before = trained.policy.planner.config
     np.random.seed(3)
-    played = trial.play_trial(trained, n_episodes=3)
+    played, n_steps = trial.play_trial(trained, n_episodes=3)
     np.random.seed(3)
     seed = int(np.random.randint(2**31))
-    for who, returns in played.items():
+    assert list(played) == ["planner", "one_step", "weighed", "expert"] and n_steps == 4 * 3 * 15
+    assert trained.policy.planner.config == before
+    for name, returns in played.items():
         env = DummyVecEnv([lambda: Monitor(pendulum())])
         env.seed(seed)
-        with trained.policy.answering(who):
+        trained.set_planner(**trial.WAYS.get(name, {}))
+        with trained.policy.answering("expert" if name == "expert" else "planner"):
             expected = evaluate_policy(trained, env, 3, return_episode_rewards=True)[0]
+        trained.policy.planner.config = before
         np.testing.assert_allclose(returns, expected, rtol=1e-5)
-    assert not np.allclose(played["planner"], played["expert"])
+    assert len({returns[0] for returns in played.values()}) == 4
+
+
+@pytest.mark.parametrize(("means", "answers"), [((1, 2, 3, 0), "planner"), ((3, 2, 1, 4), "expert")])
+def test_the_planner_decides_in_its_best_way_whoever_answers(means, answers, monkeypatch, tmp_path):
+    played = {name: np.full(2, mean) for name, mean in zip(("planner", "a", "b", "expert"), means, strict=True)}
+    monkeypatch.setattr(trial, "play_trial", lambda *_: (played, 7))
+    ways = {"a": {"temperature": 0.5}, "b": {"temperature": 1.0, "choice_factor": 2.0}}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model = make(planner_trial_episodes=2, planner_ways=ways).learn(60)
+    assert model.policy.who_answers == answers
+    config = model.policy.planner.config
+    assert (config.temperature, config.choice_factor) == ((1.0, 2.0) if answers == "planner" else (0.5, None))
+    model.save(tmp_path / "agent.zip")
+    loaded = SAID.load(tmp_path / "agent.zip", device="cpu")
+    assert loaded.policy.planner.config == config and loaded.planner_ways == ways
+
+
+def test_ways_that_are_given_are_checked_and_settings_of_the_users_own_are_kept():
+    tiny = {"planner_kwargs": {"depth": 1, "d_model": 32}, "buffer_size": 100, "device": "cpu"}
+    assert SAID("MlpPolicy", delayed(), **tiny).planner_ways == trial.WAYS
+    assert make().planner_ways == {}  # it has a temperature
+    assert make(planner_ways={}).planner_ways == {}
+    for wrong in ({"x": {"depth": 4}}, {"expert": {"temperature": 0.1}}, {"x": {"temperature": -1.0}}):
+        with pytest.raises(ValueError, match=r"depth|expert|temperature"):
+            make(planner_ways=wrong)
 
 
 @pytest.mark.parametrize("better", ["planner", "expert"])
@@ -98,7 +129,7 @@ def test_the_trial_is_no_training(monkeypatch):
 
 def test_only_the_last_training_of_many_is_tried(monkeypatch):
     """While collection goes on its episode must not be cut."""
-    calls, played = [], {"planner": np.ones(1), "expert": np.zeros(1)}
+    calls, played = [], ({"planner": np.ones(1), "expert": np.zeros(1)}, 7)
     monkeypatch.setattr(trial, "play_trial", lambda *args: calls.append(args) or played)
     make(planner_trial_episodes=1, planner_train_freq=20).learn(60)
     assert len(calls) == 1
@@ -107,19 +138,19 @@ def test_only_the_last_training_of_many_is_tried(monkeypatch):
 def test_the_same_seed_gives_the_same_trial():
     def returns():
         model = make(env=pendulum()).learn(60)
-        return trial.play_trial(model, n_episodes=2)
+        return trial.play_trial(model, n_episodes=2)[0]
 
     first, second = returns(), returns()
     for who in first:
         np.testing.assert_array_equal(first[who], second[who])
 
 
-def test_both_returns_are_logged_behind_the_planners_rows(monkeypatch, tmp_path):
+def test_returns_and_steps_are_logged_behind_the_planners_rows(monkeypatch, tmp_path):
     rigged(monkeypatch, planner=[1.0, 3.0], expert=[1.0, 1.0])
     model = make(planner_trial_episodes=2).learn(60)
     model.set_logger(configure(str(tmp_path), ["csv"]))
     model.logger.record("mine", 7)
     model.train_planner()
     rows = list(csv.DictReader((tmp_path / "progress.csv").open()))
-    assert [float(rows[-1][f"trial/{who}_return"]) for who in ("planner", "expert")] == [2.0, 1.0]
+    assert [float(rows[-1][f"trial/{key}"]) for key in ("planner_return", "expert_return", "steps")] == [2.0, 1.0, 7.0]
     assert model.logger.name_to_value["mine"] == 7  # for the user's next row
