@@ -1,5 +1,6 @@
 # make install   the virtual environment .venv, with everything
 # make train     trains SAID on a MuJoCo task under delay, evaluates it beside its expert and draws a plot
+# make demo      draws demo.gif: a trained agent under delay, beside itself as if it did not know of it
 # make test      lint, types and tests: what CI runs
 # make format    rewrites the code as `make lint` wants it
 
@@ -16,7 +17,7 @@ PRESET := quick
 LOGS := logs
 EPISODES := 20
 
-.PHONY: install train test lint type pytest format clean
+.PHONY: install train demo test lint type pytest format clean
 
 install: $(VENV)/.installed
 
@@ -36,6 +37,9 @@ train: install
 	$(PY) -u scripts/train.py --algo $(ALGO) --env $(ENV) --delay $(DELAY) --preset $(PRESET) -f $(LOGS) | tee -i $$log; \
 	run=$$(sed -n 's/^Saving to //p' $$log); rm -f $$log; test -n "$$run" && \
 	$(PY) scripts/evaluate.py "$$run" --episodes $(EPISODES) --num-threads 1 --plot "$$run/evaluation.png"
+
+demo: install
+	$(PY) scripts/enjoy.py agents/hopper.zip --delay 8 --beside-ignorant --size 240 --fps 12 --record demo.gif
 
 test: lint type pytest
 

@@ -31,20 +31,20 @@ from sb3_said.zoo.search import DRAWN, describe, find_winner, finished, open_stu
 EPILOG = f"""\
 examples:
   # the paper's grid: three planners are trained, each is tried at six temperatures
-  sb3-said tune --run logs/said/Hopper-v5-delay4-seed1_1
+  sb3-said tune logs/said/Hopper-v5-delay4-seed1_1
 
   # two workers; they may run on machines that share the folder
-  sb3-said tune --run logs/said/Hopper-v5-delay4-seed1_1 --num-threads 1 & \\
-  sb3-said tune --run logs/said/Hopper-v5-delay4-seed1_1 --num-threads 1
+  sb3-said tune logs/said/Hopper-v5-delay4-seed1_1 --num-threads 1 & \\
+  sb3-said tune logs/said/Hopper-v5-delay4-seed1_1 --num-threads 1
 
   # a quick look: one depth, fewer updates, fewer episodes, in a folder of its own
-  sb3-said tune --run logs/said/Hopper-v5-delay4-seed1_1 --depths 2 --gradient-steps 5000 --episodes 10 --output look
+  sb3-said tune logs/said/Hopper-v5-delay4-seed1_1 --depths 2 --gradient-steps 5000 --episodes 10 --output look
 
   # how the critics choose: the larger the factor, the more the best candidate decides; 100 hardly asks another
-  sb3-said tune --run logs/said/Hopper-v5-delay4-seed1_1 --depths 2 --temperatures 0.5 1 --choice-factors 0.3 1 3 100
+  sb3-said tune logs/said/Hopper-v5-delay4-seed1_1 --depths 2 --temperatures 0.5 1 --choice-factors 0.3 1 3 100
 
   # any temperature from 0 to 1, fewer denoising steps, in a data base
-  sb3-said tune --run logs/said/Hopper-v5-delay4-seed1_1 --sampler tpe --n-trials 30 --sampling-steps 1 2 5 \\
+  sb3-said tune logs/said/Hopper-v5-delay4-seed1_1 --sampler tpe --n-trials 30 --sampling-steps 1 2 5 \\
       --storage sqlite:///tune.db
 
   # then train with the winner, or play it
@@ -64,7 +64,7 @@ DEPTHS, TEMPERATURES = [2, 4, 8], [0.0, 0.1, 0.3, 0.6, 0.8, 1.0]
 def main(argv: list[str] | None = None) -> None:
     parser = make_parser(__doc__, EPILOG)
     add = parser.add_argument
-    add("--run", type=Path, required=True, metavar="RUN_DIR", help="folder that sb3-said train left")
+    add("run", type=Path, metavar="RUN_DIR", help="folder that sb3-said train left")
     add("--depths", type=int, nargs="+", default=DEPTHS, metavar="N", help="network depths (default: 2 4 8)")
     add("--temperatures", type=float, nargs="+", default=TEMPERATURES, metavar="T", help="default: 0 0.1 0.3 0.6 0.8 1")
     add("--sampling-steps", type=int, nargs="+", metavar="N", help="denoising steps (default: as the run's)")

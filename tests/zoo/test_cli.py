@@ -43,7 +43,7 @@ def test_a_command_teaches_by_its_own_name(
     shown = capsys.readouterr().out
     assert stop.value.code == 0 and f"usage: sb3-said {name} " in shown and f"\n  sb3-said {name} " in shown
     assert "scripts/" not in shown
-    bad = {"train": ["--preset", "fast"], "tune": ["--run", "x", "--prune", "2"], "over-delays": ["--json", "x"]}
+    bad = {"train": ["--preset", "fast"], "tune": ["x", "--prune", "2"], "over-delays": ["--json", "x"]}
     with pytest.raises(SystemExit) as stop:
         call(monkeypatch, name, *bad.get(name, ["nowhere", "--record", "x.gif"][: 1 if name == "evaluate" else 3]))
     assert stop.value.code == 2 and f"sb3-said {name}: error: " in capsys.readouterr().err

@@ -90,7 +90,7 @@ def test_a_run_remembers_the_package_of_its_task(
     for play in (
         lambda: evaluate.main([str(run), *few, "--latency-calls", "0"]),
         lambda: over_delays.main([str(run), *few, "--delays", "1", "--json", str(tmp_path / "over.json")]),
-        lambda: tune.main(["--run", str(run), "--depths", "1", "--temperatures", "0", "--report-episodes", "2", *few]),
+        lambda: tune.main([str(run), "--depths", "1", "--temperatures", "0", "--report-episodes", "2", *few]),
         lambda: train.main(["--resume", str(run), "-n", "60"]),
     ):
         forget_mine(monkeypatch)

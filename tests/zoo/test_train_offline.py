@@ -149,11 +149,11 @@ def test_tune_trains_depths_on_the_same_logs(finished: tuple[str, Path], monkeyp
     algo, run = finished
     if algo == "bc":
         with pytest.raises(SystemExit):
-            tune.main(["--run", str(run)])
+            tune.main([str(run)])
         return
     monkeypatch.setattr(IQL, "step", lambda _: pytest.fail("V is the run's"))
     quick = "--depths 2 --temperatures 0.5 --sampling-steps 1 --episodes 2 --round 2 --report-episodes 2".split()
-    tune.main(["--run", str(run), *quick, "--gradient-steps", "3", "--device", "cpu", "--num-threads", "1"])
+    tune.main([str(run), *quick, "--gradient-steps", "3", "--device", "cpu", "--num-threads", "1"])
     report = json.loads((run / "tune" / "results.json").read_text())["report"]
     assert [one["label"] for one in report["results"]] == ["planner"]
     assert f"--dataset {Record.read(run).dataset[0]}" in (run / "tune" / "best.yml").read_text()

@@ -67,7 +67,7 @@ def test_a_search_from_grid_to_report(
 ) -> None:
     pytest.importorskip("matplotlib")
     grid = ["--depths", "1", "2", "--temperatures", "0", "1", "--sampling-steps", "2", "--prune", "0"]
-    command = ["--run", str(run), *grid, *QUICK]
+    command = [str(run), *grid, *QUICK]
     seeds: list[int] = []
 
     def recorded(self: LoadedRun, n: int, seed: int, *args: Any, original: Any = LoadedRun.play, **kwargs: Any) -> Any:
@@ -115,7 +115,7 @@ def test_a_search_with_a_drawn_delay_or_vec_normalize(
     delay: list[int], params: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = train_said(tmp_path, *params, delay=delay)
-    tune.main(["--run", str(run), "--depths", "1", "2", "--temperatures", "0.5", *QUICK])
+    tune.main([str(run), "--depths", "1", "2", "--temperatures", "0.5", *QUICK])
     results = results_of(run)
     assert sorted((trial["depth"], trial["temperature"]) for trial in results["trials"]) == [(1, 0.5), (2, 0.5)]
 
@@ -138,7 +138,7 @@ def test_a_search_with_a_drawn_delay_or_vec_normalize(
 
 def test_a_search_for_how_the_critics_choose(run: Path) -> None:
     grid = ["--depths", "1", "--temperatures", "0.5", "1", "--choice-factors", "0.5", "100", "--prune", "0"]
-    tune.main(["--run", str(run), *grid, *QUICK])
+    tune.main([str(run), *grid, *QUICK])
     trials, winner = results_of(run)["trials"], results_of(run)["winner"]
     assert sorted((t["temperature"], t["choice_factor"]) for t in trials) == [
         (0.5, 0.5),
@@ -156,7 +156,7 @@ def test_a_search_for_how_the_critics_choose(run: Path) -> None:
 
 def test_two_workers_share_a_study_and_train_no_depth_twice(run: Path) -> None:
     grid = ["--depths", "2", "3", "--temperatures", "0", "1"]
-    command = [sys.executable, str(SCRIPT), "--run", str(run), *grid, *QUICK]
+    command = [sys.executable, str(SCRIPT), str(run), *grid, *QUICK]
     environ = {**os.environ, "OMP_NUM_THREADS": "1"}
     workers = [
         subprocess.Popen(command, env=environ, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
@@ -189,7 +189,7 @@ def test_two_workers_share_a_study_and_train_no_depth_twice(run: Path) -> None:
 )
 def test_says_what_is_wrong(run: Path, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as exit_info:
-        tune.main(["--run", str(run), *arguments])
+        tune.main([str(run), *arguments])
     assert exit_info.value.code == 2 and message in capsys.readouterr().err
 
 
@@ -199,11 +199,11 @@ def test_folders_that_cannot_be_tuned(run: Path, tmp_path: Path, capsys: pytest.
         (train_run(tmp_path, "sadr"), "is a run of 'sadr', which has no planner"),
     ):
         with pytest.raises(SystemExit):
-            tune.main(["--run", str(folder), "--device", "cpu"])
+            tune.main([str(folder), "--device", "cpu"])
         assert message in capsys.readouterr().err
     (run / CHECKPOINT_NAME).unlink()
     with pytest.raises(SystemExit):
-        tune.main(["--run", str(run), "--device", "cpu"])
+        tune.main([str(run), "--device", "cpu"])
     assert "has no checkpoint.zip" in capsys.readouterr().err
 
 
