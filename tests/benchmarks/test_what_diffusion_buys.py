@@ -53,7 +53,7 @@ def test_rows_are_played_by_whom_they_name(run, tmp_path, monkeypatch, capsys):
     returns = document["returns"]
     assert trained == [1, 1, 2, 2] and json.loads(file.read_text()) == document
     assert set(returns) == {"expert, last/None", "expert, average/None"} | {
-        f"{row}/{seed}" for row in (*script.LEARNED, "paper") for seed in (1, 2)
+        f"{row}/{seed}" for row in (*script.LEARNED, *script.PAPER) for seed in (1, 2)
     }
     assert all(len(returns[key][delay]) == 2 for key in returns for delay in ("0", "2"))
     assert all(f"| {row} | " in out for row in script.ROWS)
