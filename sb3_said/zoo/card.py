@@ -7,12 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from huggingface_hub import EvalResult, ModelCard, ModelCardData
 
 from sb3_said.delays.space import written_ages
 from sb3_said.zoo.arguments import explained, make_parser
 from sb3_said.zoo.cells import Cell, Results, average
 from sb3_said.zoo.over_delays import digest_of
+from sb3_said.zoo.presets import config_file, preset_overrides
 from sb3_said.zoo.record import Record
 from sb3_said.zoo.runs import LoadedRun, control_period, load_run, longest_delay
 
@@ -152,8 +154,15 @@ def describe(
 
 
 def made_by(record: Record) -> str:
-    """Return the command that trains such an agent."""
+    """Return the command that trains such an agent, with the settings that are not the preset's."""
     steps = record.options.get("n_timesteps")
     budget = ["-n", str(steps)] if steps and steps > 0 else []  # rl_zoo3's -1 leaves it to the YAML
+    file = config_file(record.algo, bool(record.dataset))
+    blocks = yaml.safe_load(file.read_text())
+    usual = blocks.get(record.env, blocks["default"])
+    usual |= preset_overrides(file, record.preset, record.env, record.delay, dataset=record.dataset)
+    own = {name: value for name, value in record.hyperparams.items() if value != usual.get(name)}
+    own.pop("n_timesteps", None)
+    params = ["-params", *(f"{name}:{value!r}" for name, value in own.items())] if own else []
     words = ["sb3-said", "train", "--algo", record.algo, *record.task_words(), "--preset", record.preset, *budget]
-    return shlex.join([*words, "--seed", str(record.seed)])
+    return shlex.join([*words, "--seed", str(record.seed), *params])

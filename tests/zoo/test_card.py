@@ -1,6 +1,7 @@
 """sb3-said card: what stands in it is what was measured of that very file."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from small_run import ENV, write_run
 
 from sb3_said import SAID
 from sb3_said.zoo import card, decide, evaluate, over_delays
+from sb3_said.zoo.record import Record
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +53,16 @@ def test_returns_of_another_file_are_refused(run: Path, tmp_path: Path, capsys: 
     with pytest.raises(SystemExit):
         card.main([str(agent), "--run", str(run), "--returns", str(returns)])
     assert "holds no returns of" in capsys.readouterr().err
+
+
+def test_the_command_has_what_is_not_the_presets() -> None:
+    hyperparams = {"n_timesteps": 5e5, "policy": "MultiInputPolicy", "planner_terminal_penalty": -100.0,
+                   "env_wrapper": None, "planner_gradient_steps": 7, "ent_coef": "auto_0.2"}  # fmt: skip
+    record = Record("said", "Hopper-v5", 3, [0, 4], hyperparams=hyperparams, options={"n_timesteps": 90})
+    command = card.made_by(record)
+    assert command.endswith("-n 90 --seed 3 -params planner_gradient_steps:7 'ent_coef:'\"'\"'auto_0.2'\"'\"''")
+    smoke = {"planner_kwargs": {"d_model": 64, "batch_size": 32}, "planner_trial_episodes": 2}
+    assert card.made_by(replace(record, preset="smoke", hyperparams=smoke)).endswith("-params planner_trial_episodes:2")
 
 
 def test_a_file_alone_names_its_task(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
