@@ -22,7 +22,7 @@ from sb3_said.planner.selection import choose
 from sb3_said.sac.policies import DelayedSACPolicy, rows_of, seed_of
 from sb3_said.said.student import Student
 
-Answer = Literal["planner", "expert", "student"]
+Answer = Literal["planner", "expert", "both", "student"]
 Value = Literal["critics", "iql"]
 
 
@@ -65,7 +65,7 @@ class SAIDPolicy(DelayedSACPolicy):
         if unknown := sorted(set(given) - set(names)):
             raise ValueError(f"The planner has no setting {', '.join(unknown)}; it has {', '.join(names)}.")
         self.register_buffer("planner_updates", th.zeros(()))
-        self.register_buffer("expert_preferred", th.zeros(()))  # 1: it answers although the planner is trained
+        self.register_buffer("expert_preferred", th.zeros(()))  # part of the ages, from 0 on, at which it answers
         with th.random.fork_rng(devices=[]):  # the expert learns as it would without a planner
             self.make_planner(PlannerConfig(**given))
             self.set_value(value)
@@ -112,24 +112,48 @@ class SAIDPolicy(DelayedSACPolicy):
     @property
     def who_answers(self) -> Answer:
         """Who answers ``predict``."""
-        if self._answer is None and self.student is not None and self.student.preferred:
+        if self._answer is not None:
+            return self._answer
+        if self.student is not None and self.student.preferred:
             return "student"
-        return self._answer or ("planner" if self.planner_is_trained and not self.expert_preferred else "expert")
+        if not self.planner_is_trained or self.expert_preferred == 1:
+            return "expert"
+        return "both" if self.expert_preferred > 0 else "planner"
 
     @property
     def answers(self) -> list[Answer]:
         """Who can answer ``predict``."""
         can = {"planner": self.planner_is_trained, "expert": True, "student": self.student is not None}
+        can["both"] = self.planner_is_trained and self.expert_up_to is not None
         return [who for who in get_args(Answer) if can[who]]
 
-    def set_answer(self, who: Answer) -> None:
-        """Let one of them answer ``predict`` from now on; a file keeps it.
+    @property
+    def expert_up_to(self) -> int | None:
+        """Largest age at which the expert answers where ``"both"`` do, in control steps; None where none was set."""
+        part = float(self.expert_preferred)
+        return round(part * (self.max_delay + 1)) - 1 if 0 < part < 1 else None
 
-        :param who: ``"planner"``, ``"expert"`` or ``"student"``
-        :raises ValueError: for another name, for a planner that is not trained, or for no student
+    def set_answer(self, who: Answer, expert_up_to: int | None = None) -> None:
+        """Let one of them answer ``predict`` from now on, or two; a file keeps it.
+
+        :param who: ``"planner"``, ``"expert"``, ``"student"``, or ``"both"``: the expert where the observation is
+            young, the planner where it is older
+        :param expert_up_to: with ``"both"``, the largest age at which the expert answers, in control steps
+        :raises ValueError: for another name, for a planner that is not trained, for no student, or for an
+            ``expert_up_to`` outside 0..max_delay - 1
         """
-        self._check_answer(who)
-        self.expert_preferred.fill_(float(who == "expert"))
+        part = float(who == "expert")
+        if who == "both":
+            if expert_up_to is None or not 0 <= expert_up_to < self.max_delay:
+                raise ValueError(
+                    f"expert_up_to is {expert_up_to}, expected an age in 0..{self.max_delay - 1}: the expert answers "
+                    "up to it, the planner beyond."
+                )
+            part = (expert_up_to + 1) / (self.max_delay + 1)
+        elif expert_up_to is not None:
+            raise ValueError(f"expert_up_to={expert_up_to} needs set_answer('both'), got {who!r}.")
+        self._check_answer("planner" if who == "both" else who)
+        self.expert_preferred.fill_(part)
         if self.student is not None:
             self.student.preferred.fill_(float(who == "student"))
 
@@ -137,8 +161,9 @@ class SAIDPolicy(DelayedSACPolicy):
     def answering(self, who: Answer) -> Iterator[None]:
         """Let one of them answer ``predict`` for a while, whoever would otherwise.
 
-        :param who: ``"planner"``, ``"expert"`` or ``"student"``
-        :raises ValueError: for another name, for a planner that is not trained, or for no student
+        :param who: as of :meth:`set_answer`
+        :raises ValueError: for another name, for a planner that is not trained, for no student, or for ``"both"`` where
+            no age was set
         """
         self._check_answer(who)
         before, self._answer = self._answer, who
@@ -149,8 +174,12 @@ class SAIDPolicy(DelayedSACPolicy):
 
     def _check_answer(self, who: Answer) -> None:
         if who not in get_args(Answer):
-            raise ValueError(f"Only the 'planner', the 'expert' or a 'student' can answer, got {who!r}.")
-        if who == "planner" and not self.planner_is_trained:
+            raise ValueError(f"Only the 'planner', the 'expert', 'both' or a 'student' can answer, got {who!r}.")
+        if who == "both" and self.expert_up_to is None:
+            raise ValueError(
+                "Up to which age is the expert to answer? Call set_answer('both', expert_up_to=...) first."
+            )
+        if who in ("planner", "both") and not self.planner_is_trained:
             raise ValueError("The planner is not trained yet; call learn() or train_planner() first.")
         if who == "student" and self.student is None:
             raise ValueError("There is no student yet; call distill() first.")
@@ -191,24 +220,35 @@ class SAIDPolicy(DelayedSACPolicy):
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         who = self.who_answers
-        if not deterministic:
+        if not deterministic and who != "both":
             return self._plan(observation).action if who == "planner" else super()._predict(observation)
         # Each row alone: matrix products of another batch size round differently, and can change the candidate chosen.
-        if who == "expert":
-            return th.cat([super(SAIDPolicy, self)._predict(row, True) for row in rows_of(observation)])
-        return th.cat([self._plan(row, repeats=True).action for row in rows_of(observation)])
+        return th.cat([
+            super(SAIDPolicy, self)._predict(row, deterministic)
+            if self._is_experts(row, who)
+            else self._plan(row, repeats=deterministic).action
+            for row in rows_of(observation)
+        ])  # fmt: skip
+
+    def _is_experts(self, row: PyTorchObs, who: Answer) -> bool:
+        """Tell whether the expert decides for an observation."""
+        if who != "both":
+            return who == "expert"
+        return isinstance(row, dict) and float(row[KEYS[2]]) <= (self.expert_up_to or 0)
 
     def predict_plan(self, observation: np.ndarray | dict[str, np.ndarray], deterministic: bool = False) -> np.ndarray:
         """Return the action that :meth:`predict` does, and those planned for the steps after it.
 
-        Of candidates that are chosen from, they are the best one's; of weighed ones, their weighed mean, too.
+        Of candidates that are chosen from, they are the best one's; of weighed ones, their weighed mean, too. Where
+        ``"both"`` answer and the expert decides, the planner still plans what follows.
 
         :param observation: (B, ...), as of ``predict``
         :return: (B, K, act_dim), in the units of the action space. K is the planner's ``horizon``; 1 where the planner
             does not answer
         :raises ValueError: as ``predict``
         """
-        if self.who_answers != "planner":
+        who = self.who_answers
+        if who not in ("planner", "both"):
             return self.predict(observation, deterministic=deterministic)[0][:, None]
         self.set_training_mode(False)
         config, planned = self.planner.config, []
@@ -216,7 +256,9 @@ class SAIDPolicy(DelayedSACPolicy):
             plan = self._plan(row, repeats=deterministic)
             later = plan.actions[:, :, -config.horizon :]  # (1, N, K, act_dim)
             chosen = choose(later.flatten(2), plan.values, config.choice_factor).view(1, *later.shape[2:])
-            planned.append(th.cat([plan.action[:, None], chosen[:, 1:]], dim=1))
+            is_experts = self._is_experts(row, who)
+            first = super()._predict(row, deterministic) if is_experts else plan.action
+            planned.append(th.cat([first[:, None], chosen[:, 1:]], dim=1))
         return self._checked(self.unscale_action(th.cat(planned).cpu().numpy()), observation)
 
     def _plan(self, observation: PyTorchObs, repeats: bool = False) -> Plan:

@@ -193,9 +193,9 @@ class SAID(OfflineAlgorithm, StableSAC):
             )
         self.policy.planner.config = replace(self.policy.planner.config, **settings)
 
-    def set_answer(self, who: Answer) -> None:
-        """Let one of them answer ``predict`` from now on: see :meth:`SAIDPolicy.set_answer`."""
-        self.policy.set_answer(who)
+    def set_answer(self, who: Answer, expert_up_to: int | None = None) -> None:
+        """Let one of them answer ``predict`` from now on, or two: see :meth:`SAIDPolicy.set_answer`."""
+        self.policy.set_answer(who, expert_up_to)
 
     def check_ages(self, ages: list[int]) -> None:
         """Refuse ages that the planner cannot plan at, where it answers; warn as ``DelayedSAC`` where the expert does.
@@ -203,10 +203,11 @@ class SAID(OfflineAlgorithm, StableSAC):
         :param ages: that it will meet amid episodes, in control steps
         :raises ValueError: as :meth:`InpaintingPlanner.check_ages`
         """
-        if self.policy.who_answers != "expert":  # masks were drawn from all of 0..D, so it has met every age
+        who, up_to = self.policy.who_answers, self.policy.expert_up_to
+        if who != "expert":  # masks were drawn from all of 0..D, so it has met every age
             self.policy.planner.check_ages(ages)
-        else:
-            super().check_ages(ages)
+        if who in ("expert", "both"):
+            super().check_ages([age for age in ages if who == "expert" or age <= (up_to or 0)])
 
     def distill(self, width: int = 256, **settings: Any) -> float:
         """Train a student: a plain network that answers as the planner does at temperature 0, much faster.

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.evaluation import evaluate_policy
 from tqdm.auto import tqdm
 
+from sb3_said.delays.space import KEYS
 from sb3_said.planner.config import SAMPLING_SETTINGS, PlannerConfig
 
 SAID = Any  # whose module imports this one
@@ -19,6 +21,18 @@ WAYS: dict[str, dict[str, Any]] = {
     "one_step": {"temperature": 0.0, "sampling_steps": 1},
     "weighed": {"temperature": 1.0, "sampling_steps": 2, "choice_factor": 1.0},
 }
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What :func:`play_trial` measured."""
+
+    returns: dict[str, np.ndarray]
+    """of "planner", each of ``planner_ways`` and "expert", (n_episodes,), undiscounted, in the task's own rewards"""
+    ages: np.ndarray
+    """(n_episodes,) median age of the observations of each, in control steps"""
+    n_steps: int
+    """played by all together"""
 
 
 def ways_of(given: dict[str, dict[str, Any]] | None, planner_kwargs: dict[str, Any]) -> dict[str, dict[str, Any]]:
@@ -38,7 +52,7 @@ def ways_of(given: dict[str, dict[str, Any]] | None, planner_kwargs: dict[str, A
     return given
 
 
-def play_trial(model: SAID, n_episodes: int, progress_bar: bool = False) -> tuple[dict[str, np.ndarray], int]:
+def play_trial(model: SAID, n_episodes: int, progress_bar: bool = False) -> Trial:
     """Play the training environment with the planner, in each of its ways, and with the expert, from the same seed.
 
     These are environment steps beyond those of ``learn``.
@@ -46,8 +60,6 @@ def play_trial(model: SAID, n_episodes: int, progress_bar: bool = False) -> tupl
     :param model: with a trained planner and an environment; stays as it is
     :param n_episodes: for each
     :param progress_bar: show one
-    :return: for "planner", each of ``planner_ways`` and "expert" (n_episodes,) undiscounted returns in the task's own
-        rewards; and the number of steps played
     """
     seed, own, returns, n_steps = int(np.random.randint(2**31)), model.policy.planner.config, {}, 0
     try:
@@ -56,37 +68,74 @@ def play_trial(model: SAID, n_episodes: int, progress_bar: bool = False) -> tupl
                 model.policy.planner.config = own
                 model.set_planner(**settings)
                 who = "expert" if name == "expert" else "planner"
+                ages: list[list[float]] = [[] for _ in range(env.num_envs)]
+                ended: list[tuple[int, float]] = []  # environment and median age of each episode
                 with model.policy.answering(who), tqdm(total=n_episodes, desc=name, disable=not progress_bar) as bar:
 
-                    def show(played: dict[str, Any], _: dict[str, Any], bar: Any = bar) -> None:
-                        bar.update(len(played["episode_rewards"]) - bar.n)
+                    def on_step(
+                        played: dict[str, Any], _: Any, ages: Any = ages, ended: Any = ended, bar: Any = bar
+                    ) -> None:
+                        i, observation = played["i"], played["observations"]
+                        ages[i].append(float(observation[KEYS[2]][i, 0]) if isinstance(observation, dict) else 0.0)
+                        if played["done"]:
+                            ended.append((i, float(np.median(ages[i]))))
+                            ages[i].clear()
+                            bar.update()
 
                     env.seed(seed)
-                    how = {"callback": show, "return_episode_rewards": True, "warn": False}
-                    played, lengths = evaluate_policy(model, env, n_episodes, **how)  # type: ignore[arg-type]
-                    show({"episode_rewards": played}, {})
-                    returns[name], n_steps = np.asarray(played), n_steps + sum(lengths)  # type: ignore[arg-type]
+                    how: dict[str, Any] = {"callback": on_step, "return_episode_rewards": True, "warn": False}
+                    played: Any = evaluate_policy(model, env, n_episodes, **how)
+                    order = np.argsort([i for i, _ in ended], kind="stable")  # not whose ended first
+                    returns[name], n_steps = np.asarray(played[0])[order], n_steps + sum(played[1])
     finally:
         model.policy.planner.config = own
-    return returns, n_steps
+    return Trial(returns, np.array([age for _, age in ended])[order], n_steps)
+
+
+def best_share(planner: np.ndarray, expert: np.ndarray, ages: np.ndarray) -> tuple[float, float]:
+    """Return the best mean return with the expert up to an age and the planner beyond, and that age.
+
+    The age is -1 for the planner alone, and infinite for the expert alone; between two ages that were played it is
+    midway.
+
+    :param planner: (n,) returns of episodes
+    :param expert: (n,) returns of the same episodes
+    :param ages: (n,) their ages
+    """
+    played = np.unique(ages)
+    ups = [-1.0, *np.floor((played[:-1] + played[1:]) / 2), np.inf]
+    means = [float(np.where(ages <= up, expert, planner).mean()) for up in ups]
+    best = int(np.argmax(means))
+    return means[best], ups[best]
 
 
 def let_the_best_answer(model: SAID, n_episodes: int, progress_bar: bool = False) -> dict[str, float]:
-    """Let the planner decide in its best way, and answer ``predict`` unless the expert does better; then warn.
+    """Let the planner decide in its best way, and the expert answer at the ages at which it does better.
 
-    :return: mean returns and the number of steps played, for the log
+    Warn where that is at all of them.
+
+    :return: mean returns, the expert's largest age, and the number of steps played, for the log
     """
-    returns, n_steps = play_trial(model, n_episodes, progress_bar)
-    means = {name: float(played.mean()) for name, played in returns.items()}
-    expert = means["expert"]
-    way = max((name for name in means if name != "expert"), key=means.__getitem__)
+    trial = play_trial(model, n_episodes, progress_bar)
+    expert = trial.returns["expert"]
+    ways = [name for name in trial.returns if name != "expert"]
+    shares = {name: best_share(trial.returns[name], expert, trial.ages) for name in ways}
+    way = max(ways, key=lambda name: shares[name][0])
+    up_to = shares[way][1]
+    if np.isinf(up_to):
+        way = max(ways, key=lambda name: trial.returns[name].mean())
     model.set_planner(**model.planner_ways.get(way, {}))
-    model.set_answer("planner" if means[way] >= expert else "expert")
-    if means[way] < expert:
+    if 0 <= up_to < model.policy.max_delay:
+        model.set_answer("both", int(up_to))
+    else:
+        model.set_answer("planner" if up_to < 0 else "expert")
+    if np.isinf(up_to):
         warnings.warn(
-            f"The planner is worse than its expert: mean returns of {means[way]:.5g} and {expert:.5g} "
-            f"over {n_episodes} episodes each. So the expert answers. More planner_gradient_steps or more data may "
-            "mend the planner; set_answer('planner') lets it answer all the same.",
+            f"The planner is worse than its expert: mean returns of {trial.returns[way].mean():.5g} and "
+            f"{expert.mean():.5g} over {n_episodes} episodes each. So the expert answers. More planner_gradient_steps "
+            "or more data may mend the planner; set_answer('planner') lets it answer all the same.",
             stacklevel=3,
         )
-    return {f"trial/{name}_return": mean for name, mean in means.items()} | {"trial/steps": float(n_steps)}
+    means = {f"trial/{name}_return": float(returns.mean()) for name, returns in trial.returns.items()}
+    last = float(min(up_to, model.policy.max_delay))
+    return means | {"trial/expert_up_to": last, "trial/steps": float(trial.n_steps)}

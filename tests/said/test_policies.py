@@ -1,5 +1,7 @@
 """What SAID answers: the plan of the highest value, the same for the same observation, and nothing for bad ones."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch as th
@@ -389,3 +391,54 @@ def test_a_plan_that_is_not_finite_is_refused(trained, monkeypatch):
     monkeypatch.setattr(trained.policy, "unscale_action", lambda actions: actions * np.nan)
     with pytest.raises(ValueError, match="The action is not finite"):
         trained.predict_plan(observe(), deterministic=True)
+
+
+def test_of_both_the_expert_answers_young_observations_and_the_planner_old_ones(saved):
+    model = SAID.load(saved, device="cpu")
+    obs = observe()
+    young = obs["delay"][:, 0] <= 1
+    assert young.any() and not young.all() and model.policy.expert_up_to is None
+    answers = {}
+    for who in ("planner", "expert"):
+        with model.policy.answering(who):
+            answers[who] = answer(model, obs), model.predict_plan(obs, deterministic=True)
+    model.set_answer("both", expert_up_to=1)
+    assert model.policy.who_answers == "both"
+    expected = np.where(young[:, None], answers["expert"][0], answers["planner"][0])
+    np.testing.assert_array_equal(answer(model, obs), expected)
+    np.testing.assert_array_equal([answer(model, row) for row in rows_of(obs)], expected)
+    plan = answers["planner"][1].copy()
+    plan[:, 0] = expected
+    np.testing.assert_array_equal(model.predict_plan(obs, deterministic=True), plan)
+    with model.policy.answering("planner"):
+        np.testing.assert_array_equal(answer(model, obs), answers["planner"][0])
+    set_random_seed(0)
+    first = answer(model, obs, deterministic=False)
+    set_random_seed(0)
+    np.testing.assert_array_equal(answer(model, obs, deterministic=False), first)
+    assert not np.array_equal(first, expected)
+
+
+def test_both_need_an_age_and_keep_what_each_has_met(saved, tmp_path):
+    model = SAID.load(saved, device="cpu")
+    max_delay = model.policy.max_delay
+    for wrong in (None, -1, max_delay):
+        with pytest.raises(ValueError, match="expert_up_to"):
+            model.set_answer("both", expert_up_to=wrong)
+    with pytest.raises(ValueError, match="needs set_answer"):
+        model.set_answer("planner", expert_up_to=1)
+    with pytest.raises(ValueError, match="Up to which age"), model.policy.answering("both"):
+        pass
+    model.trained_ages = [max_delay]
+    for up_to in range(max_delay):
+        model.set_answer("both", expert_up_to=up_to)
+        model.save(tmp_path / "agent.zip")
+        loaded = SAID.load(tmp_path / "agent.zip", device="cpu")
+        assert loaded.policy.expert_up_to == up_to and loaded.policy.who_answers == "both"
+        with pytest.warns(UserWarning, match="has not met"):
+            model.check_ages([up_to, max_delay])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.check_ages([max_delay])
+    with pytest.raises(ValueError, match="not trained yet"):
+        make().set_answer("both", expert_up_to=0)

@@ -6,6 +6,8 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from small_agent import answer, make, observe
 from small_task import delayed
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -18,12 +20,12 @@ from sb3_said.said import trial
 
 
 def rigged(monkeypatch, planner, expert):
-    played = {"planner": np.array(planner), "expert": np.array(expert)}, 7
+    played = trial.Trial({"planner": np.array(planner), "expert": np.array(expert)}, np.full(len(expert), 2.0), 7)
     monkeypatch.setattr(trial, "play_trial", lambda *_: played)
 
 
-def pendulum():
-    return DelayedObservationWrapper(gym.make("Pendulum-v1", max_episode_steps=15), 2)
+def pendulum(n_steps=15, delay=2):
+    return DelayedObservationWrapper(gym.make("Pendulum-v1", max_episode_steps=n_steps), delay)
 
 
 @pytest.fixture(scope="module")
@@ -34,10 +36,12 @@ def trained():
 def test_returns_are_those_of_each_who_can_answer(trained):
     before = trained.policy.planner.config
     np.random.seed(3)
-    played, n_steps = trial.play_trial(trained, n_episodes=3)
+    found = trial.play_trial(trained, n_episodes=3)
+    played = found.returns
     np.random.seed(3)
     seed = int(np.random.randint(2**31))
-    assert list(played) == ["planner", "one_step", "weighed", "expert"] and n_steps == 4 * 3 * 15
+    assert list(played) == ["planner", "one_step", "weighed", "expert"] and found.n_steps == 4 * 3 * 15
+    np.testing.assert_array_equal(found.ages, [2, 2, 2])
     assert trained.policy.planner.config == before
     for name, returns in played.items():
         env = DummyVecEnv([lambda: Monitor(pendulum())])
@@ -53,7 +57,7 @@ def test_returns_are_those_of_each_who_can_answer(trained):
 @pytest.mark.parametrize(("means", "answers"), [((1, 2, 3, 0), "planner"), ((3, 2, 1, 4), "expert")])
 def test_the_planner_decides_in_its_best_way_whoever_answers(means, answers, monkeypatch, tmp_path):
     played = {name: np.full(2, mean) for name, mean in zip(("planner", "a", "b", "expert"), means, strict=True)}
-    monkeypatch.setattr(trial, "play_trial", lambda *_: (played, 7))
+    monkeypatch.setattr(trial, "play_trial", lambda *_: trial.Trial(played, np.full(2, 2.0), 7))
     ways = {"a": {"temperature": 0.5}, "b": {"temperature": 1.0, "choice_factor": 2.0}}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -64,6 +68,44 @@ def test_the_planner_decides_in_its_best_way_whoever_answers(means, answers, mon
     model.save(tmp_path / "agent.zip")
     loaded = SAID.load(tmp_path / "agent.zip", device="cpu")
     assert loaded.policy.planner.config == config and loaded.planner_ways == ways
+
+
+def test_episodes_of_several_environments_are_the_same_ones_whoever_ends_first():
+    """A step's reward is 1, so returns tell whose environment an episode was played in."""
+
+    def make_env(n_steps):
+        return Monitor(gym.wrappers.TransformReward(pendulum(n_steps, (0, 2)), lambda _: 1.0))
+
+    env = DummyVecEnv([lambda: make_env(9), lambda: make_env(4)])
+    model = make(env=env, planner_ways={"b": {}}).learn(80)
+    found = trial.play_trial(model, n_episodes=7)
+    assert found.n_steps == 3 * (3 * 9 + 4 * 4)
+    for returns in found.returns.values():
+        np.testing.assert_array_equal(returns, [9, 9, 9, 4, 4, 4, 4])
+    assert set(found.ages) <= {0, 1, 1.5, 2} and len(set(found.ages)) > 1
+
+
+@given(st.lists(st.tuples(*[st.integers(-50, 50)] * 2, st.integers(0, 6)), min_size=1, max_size=8))
+def test_the_best_share_is_that_of_all(rows):
+    planner, expert, ages = np.array(rows, float).T
+    mean, up_to = trial.best_share(planner, expert, ages)
+    every = [np.where(ages <= cut, expert, planner).mean() for cut in range(-1, 7)]
+    assert mean == pytest.approx(max(every))
+    assert np.where(ages <= up_to, expert, planner).mean() == pytest.approx(mean)
+    assert np.isinf(up_to) == (expert.mean() > max(every[: int(ages.max()) + 1]) + 1e-12)
+
+
+def test_both_answer_where_each_does_better(monkeypatch, tmp_path):
+    found = trial.Trial({"planner": np.array([5.0, 1.0]), "expert": np.array([1.0, 3.0])}, np.array([2.0, 0.0]), 7)
+    monkeypatch.setattr(trial, "play_trial", lambda *_: found)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="The planner is worse than its expert")
+        model = make(env=pendulum(delay=(0, 2)), planner_trial_episodes=2).learn(60)
+    assert model.policy.who_answers == "both" and model.policy.expert_up_to == 1
+    model.save(tmp_path / "agent.zip")
+    loaded = SAID.load(tmp_path / "agent.zip", device="cpu")
+    assert loaded.policy.who_answers == "both" and loaded.policy.expert_up_to == 1
+    assert loaded.policy.answers == ["planner", "expert", "both"]
 
 
 def test_ways_that_are_given_are_checked_and_settings_of_the_users_own_are_kept():
@@ -129,7 +171,7 @@ def test_the_trial_is_no_training(monkeypatch):
 
 def test_only_the_last_training_of_many_is_tried(monkeypatch):
     """While collection goes on its episode must not be cut."""
-    calls, played = [], ({"planner": np.ones(1), "expert": np.zeros(1)}, 7)
+    calls, played = [], trial.Trial({"planner": np.ones(1), "expert": np.zeros(1)}, np.full(1, 2.0), 7)
     monkeypatch.setattr(trial, "play_trial", lambda *args: calls.append(args) or played)
     make(planner_trial_episodes=1, planner_train_freq=20).learn(60)
     assert len(calls) == 1
@@ -138,7 +180,7 @@ def test_only_the_last_training_of_many_is_tried(monkeypatch):
 def test_the_same_seed_gives_the_same_trial():
     def returns():
         model = make(env=pendulum()).learn(60)
-        return trial.play_trial(model, n_episodes=2)[0]
+        return trial.play_trial(model, n_episodes=2).returns
 
     first, second = returns(), returns()
     for who in first:
@@ -153,4 +195,5 @@ def test_returns_and_steps_are_logged_behind_the_planners_rows(monkeypatch, tmp_
     model.train_planner()
     rows = list(csv.DictReader((tmp_path / "progress.csv").open()))
     assert [float(rows[-1][f"trial/{key}"]) for key in ("planner_return", "expert_return", "steps")] == [2.0, 1.0, 7.0]
+    assert float(rows[-1]["trial/expert_up_to"]) == -1.0
     assert model.logger.name_to_value["mine"] == 7  # for the user's next row
