@@ -8,7 +8,7 @@ from typing import Any
 from sb3_said import SAID
 from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.zoo.arguments import TRUST, explained, make_parser
-from sb3_said.zoo.runs import find_agent
+from sb3_said.zoo.runs import ANSWERS, find_agent
 
 EPILOG = f"""\
 examples:
@@ -22,6 +22,9 @@ examples:
 
   # a quarter of the size, to hand on: weights as float16, and nothing that only training needs
   sb3-said decide logs/said/Hopper-v5-delay4-seed1_1 --compact -o hopper.zip
+
+  # the expert while the observation is at most 4 steps old, the planner beyond
+  sb3-said decide hopper.zip --answer both --expert-up-to 4 -o hopper_both.zip
 
   # the fastest decision: one candidate, one denoising step
   sb3-said decide hopper.zip --temperature 0 --sampling-steps 1 -o hopper_fast.zip
@@ -44,6 +47,10 @@ def main(argv: list[str] | None = None) -> None:
                         "weigh among the candidates, >= 0; none: the best one alone decides")  # fmt: skip
     parser.add_argument("--scored-states", metavar="WHICH", help="states of a plan that the critics score: decision, "
                         "future or all")  # fmt: skip
+    parser.add_argument("--answer", choices=ANSWERS, help="who acts; both: the expert while the observation is young, "
+                        "and the planner where it is older")  # fmt: skip
+    parser.add_argument("--expert-up-to", type=int, metavar="AGE", help="with --answer both: the largest age at which "
+                        "the expert acts, in control steps")  # fmt: skip
     parser.add_argument(
         "-o", "--output", type=Path, metavar="ZIP", help="where to save the agent with its new settings"
     )
@@ -51,22 +58,27 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(argv)
     given = {name: getattr(args, name) for name in SAMPLING_SETTINGS if getattr(args, name) is not None}
     settings: dict[str, Any] = {name: None if value == "none" else value for name, value in given.items()}
+    changes = bool(settings) or args.answer is not None
     with explained(parser):
-        if settings and args.output is None:
+        if changes and args.output is None:
             raise ValueError("-o is missing: name the file of the agent with its new settings.")
-        if args.output is not None and not (settings or args.compact):
+        if args.output is not None and not (changes or args.compact):
             raise ValueError("-o saves an agent with new settings, and none is given: add --temperature, for instance.")
         if args.compact and args.output is None:
             raise ValueError("-o is missing: name the file of the compact agent.")
         model = load_said(args.agent)
         model.set_planner(**settings)
+        if args.answer is not None or args.expert_up_to is not None:
+            model.set_answer(args.answer or model.policy.who_answers, args.expert_up_to)
     config = model.policy.planner.config
     for name in SAMPLING_SETTINGS:
         print(f"{name:14} {getattr(config, name)}" + "  (new)" * (name in settings))
     if config.temperature == 0:
         print("At temperature 0 there is one candidate: n_candidates, scored_states and choice_factor change nothing.")
     if not model.policy.planner_is_trained:
-        print("The planner of this agent is not trained yet: its expert answers.")
+        print("The planner of this agent is not trained yet.")
+    up_to = f": the expert up to age {model.policy.expert_up_to}" if model.policy.who_answers == "both" else ""
+    print(f"{'answers':14} {model.policy.who_answers}{up_to}{'  (new)' * (args.answer is not None)}")
     if args.output is not None:
         model.save(args.output, compact=args.compact)
         print(f"Wrote {args.output}")

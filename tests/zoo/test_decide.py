@@ -72,6 +72,14 @@ def test_an_agent_decides_otherwise_and_is_else_the_same(
     assert config.choice_factor is None and config.temperature == 0.5
 
 
+def test_who_answers_is_set_and_shown(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    new = tmp_path / "both.zip"
+    decide.main([str(run), "--answer", "both", "--expert-up-to", "0", "-o", str(new)])
+    assert "answers        both: the expert up to age 0  (new)" in capsys.readouterr().out
+    assert load(new).policy.who_answers == "both" and load(new).policy.expert_up_to == 0
+    assert list(results(new, tmp_path)) == ["planner", "expert", "both"]
+
+
 def test_without_settings_it_shows_them(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     decide.main([str(run / f"{ENV}.zip")])
     out = capsys.readouterr().out
@@ -85,6 +93,8 @@ def test_without_settings_it_shows_them(run: Path, capsys: pytest.CaptureFixture
         (["{run}", "-o", "x.zip"], "none is given: add --temperature"),
         (["{run}", "--temperature", "-1", "-o", "x.zip"], "temperature is -1.0, expected at least 0"),
         (["{run}", "--scored-states", "some", "-o", "x.zip"], "expected one of ('future', 'decision', 'all')"),
+        (["{run}", "--answer", "both", "-o", "x.zip"], "expert_up_to is None, expected an age in 0..1"),
+        (["{run}", "--expert-up-to", "1", "-o", "x.zip"], "add --temperature"),
         (["{run}", "--choice-factor", "best", "-o", "x.zip"], "invalid"),
         (["{sadr}"], "is a run of 'sadr', which has no planner"),
         (["{sadr_zip}"], "SAID"),
