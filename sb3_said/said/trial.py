@@ -30,7 +30,7 @@ class Trial:
     returns: dict[str, np.ndarray]
     """of "planner", each of ``planner_ways`` and "expert", (n_episodes,), undiscounted, in the task's own rewards"""
     ages: np.ndarray
-    """(n_episodes,) median age of the observations of each, in control steps"""
+    """(n_episodes,) median age of the observations of each, amid the episode, in control steps"""
     n_steps: int
     """played by all together"""
 
@@ -78,7 +78,8 @@ def play_trial(model: SAID, n_episodes: int, progress_bar: bool = False) -> Tria
                         i, observation = played["i"], played["observations"]
                         ages[i].append(float(observation[KEYS[2]][i, 0]) if isinstance(observation, dict) else 0.0)
                         if played["done"]:
-                            ended.append((i, float(np.median(ages[i]))))
+                            settled = ages[i][model.policy.max_delay :] or ages[i][-1:]  # before, the episode is young
+                            ended.append((i, float(np.median(settled))))
                             ages[i].clear()
                             bar.update()
 
