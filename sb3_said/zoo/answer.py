@@ -52,9 +52,8 @@ def evaluate_answer(model: SAID, like: EvalCallback, folder: Path, stopping: Sto
         results, ep_lengths, answers = zip(*rows.values(), strict=True)
         np.savez(file, timesteps=list(rows), results=results, ep_lengths=ep_lengths, answers=answers)
     mean = float(np.mean(returns))
-    print(
-        f"Evaluation of {'both' if who == 'both' else f'the {who}'}: mean return {mean:.2f} over {len(returns)} episodes"
-    )
+    name = "both" if who == "both" else f"the {who}"
+    print(f"Evaluation of {name}: mean return {mean:.2f} over {len(returns)} episodes")
     model.logger.record("eval/answer_mean_reward", mean)
     model.logger.record("eval/answer_mean_ep_length", float(np.mean(lengths)))
     model.logger.dump(model.num_timesteps)
