@@ -13,15 +13,15 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch as th
-from what_diffusion_buys import open_run
+from what_diffusion_buys import make_env, open_run
 
-from sb3_said import SAID, DelayedObservationWrapper
+from sb3_said import SAID
 from sb3_said.evaluation import collect_observations, confidence_interval, measure_latency, rollout
 from sb3_said.files.atomic import write_json
 from sb3_said.realtime import OnnxModel
@@ -32,13 +32,9 @@ def play(model: SAID, args: argparse.Namespace) -> dict[str, Any]:
     """Return an agent's returns by delay, and the time of its answers at the longest."""
     found: dict[str, Any] = {"returns": {}}
     for delay in args.delays:
-
-        def make_env(delay: int = delay) -> gym.Env[Any, Any]:
-            return DelayedObservationWrapper(gym.make(model.task or ""), delay, max_delay=model.policy.max_delay)
-
-        played = rollout(model, make_env, args.episodes, args.eval_seed, args.n_envs)
+        played = rollout(model, partial(make_env, model, delay), args.episodes, args.eval_seed, args.n_envs)
         found["returns"][str(delay)] = played.returns.tolist()
-    met = collect_observations(make_env, 100, args.eval_seed)
+    met = collect_observations(partial(make_env, model, max(args.delays)), 100, args.eval_seed)
     found["predict"] = vars(measure_latency(model, met, args.calls))
     if args.onnx and model.policy.who_answers == "student":
         with tempfile.TemporaryDirectory() as folder:

@@ -25,6 +25,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,9 +42,9 @@ from sb3_said.files.atomic import write_json
 from sb3_said.files.checkpoint import CHECKPOINT_NAME
 from sb3_said.offline.belief import BeliefOnly, PlannerBelief, as_in_a_window
 from sb3_said.planner.trainer import PlannerTrainer
+from sb3_said.said.trial import WAYS
 from sb3_said.zoo.runs import load_run
 
-WEIGHED = {"temperature": 1.0, "sampling_steps": 2, "choice_factor": 1.0}
 EXPERT = ("expert, last", "expert, average")
 LEARNED = ("cloning", "regressed present", "inpainted present", "one step", "SAID", "weighed")
 PAPER = {"paper": 20, "paper, 2 steps": 2}  # denoising steps
@@ -100,6 +101,11 @@ def open_run(folder: Path) -> SAID:
     return model
 
 
+def make_env(model: SAID, delay: int) -> gym.Env[Any, Any]:
+    """Return an agent's task under another fixed delay."""
+    return DelayedObservationWrapper(gym.make(model.task or ""), delay, max_delay=model.policy.max_delay)
+
+
 def train(model: SAID, config: PlannerConfig, updates: int, seed: int) -> PlannerTrainer:
     """Train a planner of these settings on the agent's replay, and hand it over."""
     model.policy.make_planner(config)
@@ -132,7 +138,7 @@ def players(model: SAID, rows: list[str], args: argparse.Namespace) -> Iterator[
                 yield "cloning", seed, regression
                 yield "regressed present", seed, BeliefOnly(regression, model)
                 yield "inpainted present", seed, BeliefOnly(PlannerBelief(policy.planner), model)
-            for row, how in (("SAID", {}), ("one step", {"sampling_steps": 1}), ("weighed", WEIGHED)):
+            for row, how in (("SAID", {}), ("one step", {"sampling_steps": 1}), ("weighed", WAYS["weighed"])):
                 model.set_planner(**how)
                 with policy.answering("planner"):
                     yield row, seed, model
@@ -171,12 +177,8 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     for row, seed, player in players(model, missing, args):
         key = f"{row}/{seed}"
         for delay in args.delays if key in missing else ():
-
-            def make_env(delay: int = delay) -> gym.Env[Any, Any]:
-                return DelayedObservationWrapper(gym.make(model.task or ""), delay, max_delay=model.policy.max_delay)
-
             if str(delay) not in returns.setdefault(key, {}):
-                played = rollout(player, make_env, args.episodes, args.eval_seed, args.n_envs)
+                played = rollout(player, partial(make_env, model, delay), args.episodes, args.eval_seed, args.n_envs)
                 returns[key][str(delay)] = played.returns.tolist()
                 write_json(args.json, document)
     show(returns, args)

@@ -116,9 +116,9 @@ class SAIDPolicy(DelayedSACPolicy):
             return self._answer
         if self.student is not None and self.student.preferred:
             return "student"
-        if not self.planner_is_trained or self.expert_preferred == 1:
+        if not self.planner_is_trained or self.expert_ages > self.max_delay:
             return "expert"
-        return "both" if self.expert_preferred > 0 else "planner"
+        return "both" if self.expert_ages > 0 else "planner"
 
     @property
     def answers(self) -> list[Answer]:
@@ -128,10 +128,14 @@ class SAIDPolicy(DelayedSACPolicy):
         return [who for who in get_args(Answer) if can[who]]
 
     @property
+    def expert_ages(self) -> int:
+        """How many ages, from 0 on, the expert answers at: 0 for the planner alone, D + 1 for the expert alone."""
+        return round(float(self.expert_preferred) * (self.max_delay + 1))
+
+    @property
     def expert_up_to(self) -> int | None:
         """Largest age at which the expert answers where ``"both"`` do, in control steps; None where none was set."""
-        part = float(self.expert_preferred)
-        return round(part * (self.max_delay + 1)) - 1 if 0 < part < 1 else None
+        return self.expert_ages - 1 if 0 < self.expert_ages <= self.max_delay else None
 
     def set_answer(self, who: Answer, expert_up_to: int | None = None) -> None:
         """Let one of them answer ``predict`` from now on, or two; a file keeps it.
@@ -234,7 +238,7 @@ class SAIDPolicy(DelayedSACPolicy):
         """Tell whether the expert decides for an observation."""
         if who != "both":
             return who == "expert"
-        return isinstance(row, dict) and float(row[KEYS[2]]) <= (self.expert_up_to or 0)
+        return isinstance(row, dict) and float(row[KEYS[2]]) < self.expert_ages
 
     def predict_plan(self, observation: np.ndarray | dict[str, np.ndarray], deterministic: bool = False) -> np.ndarray:
         """Return the action that :meth:`predict` does, and those planned for the steps after it.

@@ -203,11 +203,11 @@ class SAID(OfflineAlgorithm, StableSAC):
         :param ages: that it will meet amid episodes, in control steps
         :raises ValueError: as :meth:`InpaintingPlanner.check_ages`
         """
-        who, up_to = self.policy.who_answers, self.policy.expert_up_to
+        who = self.policy.who_answers
         if who != "expert":  # masks were drawn from all of 0..D, so it has met every age
             self.policy.planner.check_ages(ages)
         if who in ("expert", "both"):
-            super().check_ages([age for age in ages if who == "expert" or age <= (up_to or 0)])
+            super().check_ages([age for age in ages if who == "expert" or age < self.policy.expert_ages])
 
     def distill(self, width: int = 256, **settings: Any) -> float:
         """Train a student: a plain network that answers as the planner does at temperature 0, much faster.

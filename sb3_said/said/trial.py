@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecEnv
 from tqdm.auto import tqdm
 
 from sb3_said.delays.space import KEYS
@@ -61,36 +62,41 @@ def play_trial(model: SAID, n_episodes: int, progress_bar: bool = False) -> Tria
     :param n_episodes: for each
     :param progress_bar: show one
     """
-    seed, own, returns, n_steps = int(np.random.randint(2**31)), model.policy.planner.config, {}, 0
+    seed, own = int(np.random.randint(2**31)), model.policy.planner.config
+    returns, n_steps = {}, 0
     try:
         with model.borrowed_env() as env:
             for name, settings in {"planner": {}, **model.planner_ways, "expert": {}}.items():
                 model.policy.planner.config = own
                 model.set_planner(**settings)
+                env.seed(seed)
                 who = "expert" if name == "expert" else "planner"
-                ages: list[list[float]] = [[] for _ in range(env.num_envs)]
-                ended: list[tuple[int, float]] = []  # environment and median age of each episode
                 with model.policy.answering(who), tqdm(total=n_episodes, desc=name, disable=not progress_bar) as bar:
-
-                    def on_step(
-                        played: dict[str, Any], _: Any, ages: Any = ages, ended: Any = ended, bar: Any = bar
-                    ) -> None:
-                        i, observation = played["i"], played["observations"]
-                        ages[i].append(float(observation[KEYS[2]][i, 0]) if isinstance(observation, dict) else 0.0)
-                        if played["done"]:
-                            settled = ages[i][model.policy.max_delay :] or ages[i][-1:]  # before, the episode is young
-                            ended.append((i, float(np.median(settled))))
-                            ages[i].clear()
-                            bar.update()
-
-                    env.seed(seed)
-                    how: dict[str, Any] = {"callback": on_step, "return_episode_rewards": True, "warn": False}
-                    played: Any = evaluate_policy(model, env, n_episodes, **how)
-                    order = np.argsort([i for i, _ in ended], kind="stable")  # not whose ended first
-                    returns[name], n_steps = np.asarray(played[0])[order], n_steps + sum(played[1])
+                    returns[name], ages, n_played = _play(model, env, n_episodes, bar)
+                n_steps += n_played
     finally:
         model.policy.planner.config = own
-    return Trial(returns, np.array([age for _, age in ended])[order], n_steps)
+    return Trial(returns, ages, n_steps)
+
+
+def _play(model: SAID, env: VecEnv, n_episodes: int, bar: tqdm) -> tuple[np.ndarray, np.ndarray, int]:
+    """Return the episodes' returns and ages, by environment and not by whose ended first, and the steps of all."""
+    ages: list[list[float]] = [[] for _ in range(env.num_envs)]
+    ended: list[tuple[int, float]] = []  # environment and age of each episode
+
+    def on_step(played: dict[str, Any], _: dict[str, Any]) -> None:
+        i, observation = played["i"], played["observations"]
+        ages[i].append(float(observation[KEYS[2]][i, 0]) if isinstance(observation, dict) else 0.0)
+        if played["done"]:
+            settled = ages[i][model.policy.max_delay :] or ages[i][-1:]  # before, the episode is young
+            ended.append((i, float(np.median(settled))))
+            ages[i].clear()
+            bar.update()
+
+    played: Any = evaluate_policy(model, env, n_episodes, callback=on_step, return_episode_rewards=True, warn=False)
+    returns, lengths = played
+    order = np.argsort([i for i, _ in ended], kind="stable")
+    return np.asarray(returns)[order], np.array([age for _, age in ended])[order], sum(lengths)
 
 
 def best_share(planner: np.ndarray, expert: np.ndarray, ages: np.ndarray) -> tuple[float, float]:

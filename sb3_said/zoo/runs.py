@@ -205,7 +205,7 @@ def longest_delay(model: BaseAlgorithm) -> int | None:
 
 
 def control_period(run: LoadedRun) -> float | None:
-    """Return the control step of a simulated robot, in seconds; None where the task does not tell, as MuJoCo's do."""
+    """Return the control step of a simulated robot, in seconds; None where the task does not tell it."""
     env = run.make_env()
     try:
         return getattr(env.unwrapped, "dt", None)

@@ -21,7 +21,7 @@ TINY = {"n_labels": 40, "own_steps": 10, "rounds": 1, "gradient_steps": 5, "batc
 
 def test_students_are_played_beside_their_planner(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run, file = write_run(tmp_path / "run-v0", SAID, (0, 2), 90, checkpoint=True), tmp_path / "distillation.json"
-    words = [str(run), "--settings", json.dumps(TINY), "--delays", "0", "2", "--episodes", "2", "--calls", "3", 
+    words = [str(run), "--settings", json.dumps(TINY), "--delays", "0", "2", "--episodes", "2", "--calls", "3",
              "--onnx", "--json", str(file)]  # fmt: skip
     rows = script.main([*words, "--seeds", "5", "--q-weights", "0.5"])
     name = "student, q_weight 0.5, seed 5"
