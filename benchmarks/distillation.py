@@ -2,8 +2,9 @@
 
     python benchmarks/distillation.py RUN --seeds 1 2 --q-weights 0 0.1 --delays 0 4 8 16 --json distillation.json
 
-RUN is the folder of a SAID run that has ended, with its checkpoint, which holds the replay. Each student learns from
-the planner at temperature 0, as model.distill() does by itself. "kept" is its mean return over the planner's, all
+RUN is the folder of a SAID run that has ended, with its checkpoint, which holds the replay, or any SAID agent with a
+log of the task in the replay's place (--log, such as scripts/collect.py makes). Each student learns from the planner at
+temperature 0, as model.distill() does by itself. "kept" is its mean return over the planner's, all
 delays together. Times are of single answers on one thread: of predict(), and of the exported graph (--onnx).
 A call plays what --json lacks, so the same command goes on after a stop.
 """
@@ -26,6 +27,20 @@ from sb3_said.evaluation import collect_observations, confidence_interval, measu
 from sb3_said.files.atomic import write_json
 from sb3_said.realtime import OnnxModel
 from sb3_said.said.export import export
+from sb3_said.zoo.runs import load_run
+
+
+def open_with_log(agent: Path, log: Path) -> SAID:
+    """Return an agent whose replay is a log of its task.
+
+    :raises ValueError: when it is no SAID agent, or the log not of its task
+    """
+    run = load_run(agent, device="cpu")
+    if not isinstance(run.model, SAID):
+        raise ValueError(f"{agent} is a {type(run.model).__name__}; give a SAID agent.")
+    run.model.set_env(run.make_env())
+    run.model.take_dataset(log)
+    return run.model
 
 
 def play(model: SAID, args: argparse.Namespace) -> dict[str, Any]:
@@ -48,6 +63,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     """Distil, play, print, write, and return the numbers."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("run", type=Path, metavar="RUN")
+    p.add_argument("--log", type=Path, help="dataset to learn from")
     p.add_argument("--seeds", type=int, nargs="+", default=[1], help="of the students")
     p.add_argument("--q-weights", type=float, nargs="+", default=[0.0, 0.1], help="of -min Q(s, a) in the loss")
     p.add_argument("--settings", type=json.loads, default={}, metavar="JSON", help="other settings of distill()")
@@ -62,7 +78,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     args = p.parse_args(argv)
     th.set_num_threads(args.num_threads)
     rows: dict[str, Any] = json.loads(args.json.read_text()) if args.json.exists() else {}
-    model = open_run(args.run)
+    model = open_run(args.run) if args.log is None else open_with_log(args.run, args.log)
     model.set_planner(temperature=0.0)
     if "planner" not in rows:
         with model.policy.answering("planner"):

@@ -12,8 +12,9 @@ import distillation as script
 from small_run import write_run
 from what_diffusion_buys import open_run
 
-from sb3_said import SAID
+from sb3_said import SAID, DelayedSAC
 from sb3_said.evaluation import rollout
+from sb3_said.zoo import collect
 from sb3_said.zoo.runs import load_run
 
 TINY = {"n_labels": 40, "own_steps": 10, "rounds": 1, "gradient_steps": 5, "batch_size": 8}
@@ -39,3 +40,18 @@ def test_students_are_played_beside_their_planner(tmp_path: Path, capsys: pytest
             assert rollout(model, make_env, 2, 10_000, 20).returns.tolist() == rows[row]["returns"]["2"]
 
     assert script.main([*words, "--seeds", "5", "--q-weights", "0.5"]) == rows
+
+
+def test_a_log_takes_the_replays_place(tmp_path: Path) -> None:
+    run, log, file = write_run(tmp_path / "run-v0", SAID, (0, 2), 90), tmp_path / "log.npz", tmp_path / "rows.json"
+    collect.main([str(run), "--steps", "60", "--n-envs", "1", "-o", str(log), "--device", "cpu"])
+    words = [str(run), "--log", str(log), "--settings", json.dumps(TINY), "--delays", "0", "2", "--episodes", "1"]
+    rows = script.main([*words, "--calls", "1", "--q-weights", "0.5", "--json", str(file)])
+
+    model = script.open_with_log(run, log)
+    assert model.replay_buffer.size() == 60
+    model.seed = 1
+    assert model.distill(q_weight=0.5, **TINY) == rows["student, q_weight 0.5, seed 1"]["error"]
+    write_run(tmp_path / "expert-v0", DelayedSAC, 2)
+    with pytest.raises(ValueError, match="DelayedSAC; give a SAID agent"):
+        script.open_with_log(tmp_path / "expert-v0", log)
