@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,9 +16,10 @@ from sb3_said.planner.config import SAMPLING_SETTINGS, PlannerConfig
 
 SAID = Any  # whose module imports this one
 
-#: What a trial compares with an agent's own settings: a single step, and the mean of all candidates, weighed by the
-#: critics. Which is best depends on task, delay and budget (measured, results/settings.md).
+#: What a trial compares with an agent's own settings: the default's steps, a single step, and the mean of all candidates,
+#: weighed by the critics. Which is best depends on task, delay and budget (measured, results/settings.md).
 WAYS: dict[str, dict[str, Any]] = {
+    "default": {"temperature": 0.0, "sampling_steps": PlannerConfig.sampling_steps},
     "one_step": {"temperature": 0.0, "sampling_steps": 1},
     "weighed": {"temperature": 1.0, "sampling_steps": 2, "choice_factor": 1.0},
 }
@@ -29,7 +30,8 @@ class Trial:
     """What :func:`play_trial` measured."""
 
     returns: dict[str, np.ndarray]
-    """of "planner", each of ``planner_ways`` and "expert", (n_episodes,), undiscounted, in the task's own rewards"""
+    """of "planner", those of ``planner_ways`` that differ from it, and "expert", (n_episodes,), undiscounted, in the
+    task's own rewards"""
     ages: np.ndarray
     """(n_episodes,) median age of the observations of each, amid the episode, in control steps"""
     n_steps: int
@@ -63,12 +65,13 @@ def play_trial(model: SAID, n_episodes: int, progress_bar: bool = False) -> Tria
     :param progress_bar: show one
     """
     seed, own = int(np.random.randint(2**31)), model.policy.planner.config
+    ways = {name: replace(own, **settings) for name, settings in model.planner_ways.items()}
+    others = {name: config for name, config in ways.items() if config != own}
     returns, n_steps = {}, 0
     try:
         with model.borrowed_env() as env:
-            for name, settings in {"planner": {}, **model.planner_ways, "expert": {}}.items():
-                model.policy.planner.config = own
-                model.set_planner(**settings)
+            for name, config in {"planner": own, **others, "expert": own}.items():
+                model.policy.planner.config = config
                 env.seed(seed)
                 who = "expert" if name == "expert" else "planner"
                 with model.policy.answering(who), tqdm(total=n_episodes, desc=name, disable=not progress_bar) as bar:

@@ -40,7 +40,7 @@ def test_returns_are_those_of_each_who_can_answer(trained):
     played = found.returns
     np.random.seed(3)
     seed = int(np.random.randint(2**31))
-    assert list(played) == ["planner", "one_step", "weighed", "expert"] and found.n_steps == 4 * 3 * 15
+    assert list(played) == ["planner", "default", "one_step", "weighed", "expert"] and found.n_steps == 5 * 3 * 15
     np.testing.assert_array_equal(found.ages, [2, 2, 2])
     assert trained.policy.planner.config == before
     for name, returns in played.items():
@@ -51,7 +51,17 @@ def test_returns_are_those_of_each_who_can_answer(trained):
             expected = evaluate_policy(trained, env, 3, return_episode_rewards=True)[0]
         trained.policy.planner.config = before
         np.testing.assert_allclose(returns, expected, rtol=1e-5)
-    assert len({returns[0] for returns in played.values()}) == 4
+    assert len({returns[0] for returns in played.values()}) == 5
+
+
+def test_a_way_that_the_planner_already_has_is_not_played_twice_and_the_way_back_is(trained):
+    own = trained.policy.planner.config
+    try:
+        trained.set_planner(**trial.WAYS["one_step"])
+        returns = trial.play_trial(trained, n_episodes=1).returns
+    finally:
+        trained.policy.planner.config = own
+    assert list(returns) == ["planner", "default", "weighed", "expert"]
 
 
 @pytest.mark.parametrize(("means", "answers"), [((1, 2, 3, 0), "planner"), ((3, 2, 1, 4), "expert")])
@@ -77,7 +87,7 @@ def test_episodes_of_several_environments_are_the_same_ones_whoever_ends_first()
         return Monitor(gym.wrappers.TransformReward(pendulum(n_steps, (0, 2)), lambda _: 1.0))
 
     env = DummyVecEnv([lambda: make_env(9), lambda: make_env(4)])
-    model = make(env=env, planner_ways={"b": {}}).learn(80)
+    model = make(env=env, planner_ways={"b": {"sampling_steps": 1}}).learn(80)
     found = trial.play_trial(model, n_episodes=7)
     assert found.n_steps == 3 * (3 * 9 + 4 * 4)
     for returns in found.returns.values():
