@@ -3,15 +3,15 @@
     python benchmarks/motivation.py --env Hopper-v5 --dataset medium.npz --json motivation.json --plot motivation.png
     python benchmarks/motivation.py ... --actor logs/sadr/Hopper-v5-seed1_1    # who acts on the beliefs, in BC's place
 
-Three beliefs of the present learn from the same episodes, with as many gradient steps each: "inpainted" is SAID's
-planner, "rolled out" an MLP of one step that is rolled out over the actions since, "regressed" an MLP that is asked for
-the present at once. One network of each serves all delays.
+Three beliefs of the present learn from the same episodes: "inpainted" is SAID's planner, "rolled out" an MLP of one
+step that is rolled out over the actions since, "regressed" an MLP that is asked for the present at once. One network of
+each serves all delays, and --plain-steps gives the plain ones as many gradient steps as they need.
 
 error   root mean squared error of s_t on held-out episodes, in standard deviations of the states, the same windows for
         all beliefs
 return  of one actor without delay that acts on each belief, over seeded episodes: behaviour cloning of the same
-        episodes at delay 0, or --actor. Beside it "old observation", on which it acts as if nothing was delayed, and
-        "SAID", whose planner decides itself
+        episodes at delay 0, or --actor. Beside it "old observation", on which it acts as if nothing was delayed,
+        "SAID", whose planner decides itself, and "cloning": BC on the augmented state
 """
 
 from __future__ import annotations
@@ -67,11 +67,17 @@ def split(data: Dataset, held_out: float, seed: int) -> tuple[Dataset, Dataset]:
     return data.select(~is_held), data.select(is_held)
 
 
-def train(data: Dataset, args: argparse.Namespace) -> tuple[SAID, dict[str, Belief], Any]:
-    """Return SAID, the beliefs by name and the actor."""
+def train(data: Dataset, args: argparse.Namespace) -> tuple[dict[str, Belief], Any, dict[str, Any]]:
+    """Return the beliefs by name, the actor without delay, and by name who decides under delay by itself."""
     task = gym.make(args.env)
     env = DelayedObservationWrapper(gym.make(args.env), delay=(0, args.max_delay))
-    said = SAID("MlpPolicy", env, seed=args.seed, device=args.device, planner_kwargs=args.planner_kwargs)
+    said = SAID(
+        *("MlpPolicy", env),
+        planner_kwargs=args.planner_kwargs,
+        planner_terminal_penalty=args.terminal_penalty,
+        seed=args.seed,
+        device=args.device,
+    )
     # rows of the log go nowhere; a progress bar shows the updates
     said.learn_offline(data, args.gradient_steps, folder=args.folder, progress_bar=True)
     source = data.to_replay(task.observation_space, task.action_space).window_source()
@@ -80,16 +86,21 @@ def train(data: Dataset, args: argparse.Namespace) -> tuple[SAID, dict[str, Beli
     for name, cls in (("rolled out", RolledOutModel), ("regressed", RegressedPresent)):
         th.manual_seed(args.seed)
         networks[name] = cls(*sizes).to(args.device)
-        train_belief(networks[name], source, args.gradient_steps, seed=args.seed, progress_bar=True)
+        train_belief(networks[name], source, args.plain_steps, seed=args.seed, progress_bar=True)
+
+    def clone(env: gym.Env[Any, Any]) -> BC:
+        bc = BC("MultiInputPolicy", env, seed=args.seed, device=args.device, buffer_size=10)
+        return bc.learn_offline(data, args.plain_steps, progress_bar=True)
+
     if args.actor is not None:
         from sb3_said.zoo.runs import load_run
 
         actor: Any = load_run(args.actor, device=args.device).model
     else:
-        actor = BC("MlpPolicy", task, seed=args.seed, device=args.device, buffer_size=10)
-        actor.learn_offline(data, args.gradient_steps, progress_bar=True)
-    beliefs = {"inpainted": PlannerBelief(said.policy.planner), **networks}
-    return said, beliefs | {"old observation": OldObservation(args.max_delay)}, actor
+        actor = clone(task)
+    beliefs: dict[str, Belief] = {"inpainted": PlannerBelief(said.policy.planner), **networks}
+    beliefs["old observation"] = OldObservation(args.max_delay)
+    return beliefs, actor, {"SAID": said, "cloning": clone(env)}
 
 
 def errors(held: Dataset, beliefs: dict[str, Belief], args: argparse.Namespace) -> dict[str, list[float]]:
@@ -117,7 +128,7 @@ def returns(players: dict[str, Any], args: argparse.Namespace) -> dict[str, list
 
 def draw(path: Path, document: dict[str, Any], table: dict[str, list[Summary]]) -> None:
     """Draw errors and returns over the delay, side by side."""
-    title = f"{document['env']}: {document['gradient_steps']:,} gradient steps each"
+    title = f"{document['env']}: {document['gradient_steps']:,} updates of the planner"
     left, right = plots.panels(2, title, width=5.5)
     rows = {**{name: None for name in document["errors"]}, **{name: None for name in table}}
     color_of = dict(zip(rows, plots.colors(len(rows)), strict=True))
@@ -150,7 +161,9 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     p.add_argument("--env", default="Hopper-v5")
     p.add_argument("--dataset", nargs="+", required=True, help="ids of Minari datasets, or files")
     p.add_argument("--delays", type=int, nargs="+", default=[0, 1, 2, 4, 8, 12, 16])
-    p.add_argument("--gradient-steps", type=int, default=25_000, help="of each network")
+    p.add_argument("--gradient-steps", type=int, default=25_000, help="of the planner")
+    p.add_argument("--plain-steps", type=int, help="of each plain network (default: those of the planner)")
+    p.add_argument("--terminal-penalty", type=float, default=0.0, help="of an end by falling, in the planner's values")
     p.add_argument("--actor", help="run folder or .zip of an agent of the task without delay (default: BC)")
     p.add_argument("--held-out", type=float, default=0.05, help="part of the episodes that no network learns from")
     p.add_argument("--episodes", type=int, default=50, help="of each return")
@@ -165,21 +178,23 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     p.add_argument("--plot", type=Path)
     args = p.parse_args(argv)
     args.max_delay = max(args.delays)
+    args.plain_steps = args.plain_steps or args.gradient_steps
     th.set_num_threads(args.num_threads)
 
     task = gym.make(args.env)
     data = load_dataset(args.dataset, task.observation_space, task.action_space, args.env)
     training, held = split(data, args.held_out, args.seed)
-    said, beliefs, actor = train(training, args)
+    beliefs, actor, deciders = train(training, args)
     document: dict[str, Any] = {
         name: getattr(args, name)
-        for name in ("env", "dataset", "delays", "gradient_steps", "episodes", "seed", "actor")
+        for name in ("env", "dataset", "delays", "gradient_steps", "plain_steps", "episodes", "seed", "actor")
     }
+    document["terminal_penalty"] = args.terminal_penalty
     document |= {"training_steps": len(training), "held_out_steps": len(held), "held_out_episodes": len(held.lengths)}
-    document["planner"] = said.policy.planner.config.to_dict()
+    document["planner"] = deciders["SAID"].policy.planner.config.to_dict()
     document["errors"] = errors(held, beliefs, args)
     show({k: [f"{x:.3f}" for x in row] for k, row in document["errors"].items()}, "error at delay", args.delays)
-    players = {name: BeliefOnly(belief, actor, args.device) for name, belief in beliefs.items()} | {"SAID": said}
+    players = {name: BeliefOnly(belief, actor, args.device) for name, belief in beliefs.items()} | deciders
     table = returns(players, args)
     show({k: [str(s.mean_return) for s in row] for k, row in table.items()}, "return at delay", args.delays)
     document["returns"] = {name: [summary.to_dict() for summary in row] for name, row in table.items()}
