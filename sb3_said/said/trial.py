@@ -16,8 +16,8 @@ from sb3_said.planner.config import SAMPLING_SETTINGS, PlannerConfig
 
 SAID = Any  # whose module imports this one
 
-#: What a trial compares with an agent's own settings: the default's steps, a single step, and the mean of all candidates,
-#: weighed by the critics. Which is best depends on task, delay and budget (measured, results/settings.md).
+#: What a trial compares with an agent's own settings: the default's steps, a single step, and the mean of all
+#: candidates, weighed by the critics. Which is best depends on task, delay and budget (measured, results/settings.md).
 WAYS: dict[str, dict[str, Any]] = {
     "default": {"temperature": 0.0, "sampling_steps": PlannerConfig.sampling_steps},
     "one_step": {"temperature": 0.0, "sampling_steps": 1},
