@@ -9,9 +9,11 @@ expert, average      the average of its weights
 cloning              a plain network from what is known under delay to the action, weighted as the planner is
 regressed present    such a network for the present, and the expert's actor for age 0 on it
 inpainted present    the planner's present, and the same actor
-one step             SAID in one denoising step
-SAID                 SAID as its preset decides
+one step             SAID in one denoising step at temperature 0
+SAID                 SAID as its preset decides: in five steps at temperature 0
 weighed              SAID whose critics weigh the candidates of two steps at temperature 1
+chosen by Q          the best of these candidates by the mean min Q(s, a) of the steps planned after the decision
+chosen by V          the same by V(s), learned on the replay by implicit Q-learning with two steps for each update
 paper                SAID with the paper's settings (Tables 3 and 4); seconds a decision on a CPU
 paper, 2 steps       the same planner in two denoising steps, which the paper has in its appendix, a tenth of the time
 
@@ -25,6 +27,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -46,7 +49,15 @@ from sb3_said.said.trial import WAYS
 from sb3_said.zoo.runs import load_run
 
 EXPERT = ("expert, last", "expert, average")
-LEARNED = ("cloning", "regressed present", "inpainted present", "one step", "SAID", "weighed")
+NETWORKS = ("cloning", "regressed present", "inpainted present")
+SETTINGS: dict[str, dict[str, Any]] = {
+    "SAID": {},
+    "one step": WAYS["one_step"],
+    "weighed": WAYS["weighed"],
+    "chosen by Q": {"temperature": 1.0, "sampling_steps": 2, "scored_states": "future"},
+}
+SETTINGS["chosen by V"] = SETTINGS["chosen by Q"]
+LEARNED = (*NETWORKS, *SETTINGS)
 PAPER = {"paper": 20, "paper, 2 steps": 2}  # denoising steps
 ROWS = (*EXPERT, *LEARNED, *PAPER)
 
@@ -117,6 +128,17 @@ def train(model: SAID, config: PlannerConfig, updates: int, seed: int) -> Planne
     return trainer
 
 
+def learn_values(model: SAID, updates: int) -> None:
+    """Learn V(s) on the agent's replay, and let it score plans."""
+    model.policy.set_value("iql")
+    learner = model._make_value_trainer()
+    assert learner is not None  # as V(s) was just asked for
+    for _ in tqdm(range(updates * learner.values.config.updates), desc="V(s)"):
+        learner.step()
+    assert model.policy.values is not None
+    model.policy.values.load_state_dict(learner.values.state_dict())
+
+
 def players(model: SAID, rows: list[str], args: argparse.Namespace) -> Iterator[tuple[str, int | None, Any]]:
     """Yield rows, their seed and who plays them; trains what is missing.
 
@@ -129,7 +151,7 @@ def players(model: SAID, rows: list[str], args: argparse.Namespace) -> Iterator[
     if "expert, average/None" in rows:
         with policy.answering("expert"):
             yield "expert, average", None, model
-    preset = policy.planner.config
+    preset = replace(policy.planner.config, **WAYS["default"])  # whatever the run's own trial chose
     for seed in args.seeds:
         if any(f"{row}/{seed}" in rows for row in LEARNED):
             trainer = train(model, preset, args.updates, seed)
@@ -138,10 +160,13 @@ def players(model: SAID, rows: list[str], args: argparse.Namespace) -> Iterator[
                 yield "cloning", seed, regression
                 yield "regressed present", seed, BeliefOnly(regression, model)
                 yield "inpainted present", seed, BeliefOnly(PlannerBelief(policy.planner), model)
-            for row, how in (("SAID", {}), ("one step", {"sampling_steps": 1}), ("weighed", WAYS["weighed"])):
-                model.set_planner(**how)
+            for row, how in SETTINGS.items():
+                if row == "chosen by V" and f"{row}/{seed}" in rows:
+                    learn_values(model, args.updates)
+                policy.planner.config = replace(preset, **how)
                 with policy.answering("planner"):
                     yield row, seed, model
+            policy.set_value("critics")
         if any(f"{row}/{seed}" in rows for row in PAPER):
             train(model, PlannerConfig.paper(mask=preset.mask, ema_warmup=True), args.updates, seed)
             for row, steps in PAPER.items():

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium as gym
@@ -68,6 +69,15 @@ def test_rows_are_played_by_whom_they_name(run, tmp_path, monkeypatch, capsys):
 
     script.main([*words, "--seeds", "1"])
     assert trained == [1, 1, 2, 2]  # all known
+
+    assert model.policy.values is None
+    script.train(model, replace(model.policy.planner.config, **script.WAYS["default"]), 3, 1)
+    for row in ("chosen by Q", "chosen by V"):
+        if row == "chosen by V":
+            script.learn_values(model, 3)
+        model.set_planner(**script.SETTINGS[row])
+        with model.policy.answering("planner"):
+            assert rollout(model, make, 2, 10_000, 20).returns.tolist() == returns[f"{row}/1"]["2"]
 
 
 def test_of_a_run_that_has_not_ended_the_checkpoint_counts(run):
