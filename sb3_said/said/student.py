@@ -21,15 +21,17 @@ LABELLED_AT_ONCE = 512
 
 @dataclass(frozen=True)
 class Distillation:
-    """How a student learns. The values are ours, found to suffice on small tasks."""
+    """How a student learns. The values are ours; a quarter of these visits and a third of these updates kept 81 % of a
+    Hopper-v5 planner's return where these kept all of it (results/student.md).
+    """
 
     n_labels: int = 50_000
     """answers of the planner to observations from the replay, at ages drawn from all that it plans at"""
-    own_steps: int = 10_000
+    own_steps: int = 40_000
     """and to those that the student visits itself (DAgger, Ross et al. 2011), over all rounds"""
-    rounds: int = 4
+    rounds: int = 10
     """of visiting and learning on, after the first learning"""
-    gradient_steps: int = 20_000
+    gradient_steps: int = 60_000
     """updates, over all rounds"""
     batch_size: int = 256
     learning_rate: float = 1e-3
