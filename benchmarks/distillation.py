@@ -89,7 +89,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
             name = f"student, q_weight {q_weight:g}, seed {seed}"
             if name not in rows:
                 model.seed = seed
-                error = model.distill(q_weight=q_weight, **args.settings)
+                error = model.distill(q_weight=q_weight, progress_bar=True, **args.settings)
                 with model.policy.answering("student"):
                     rows[name] = play(model, args) | {"error": error}
                 write_json(args.json, rows)

@@ -209,14 +209,15 @@ class SAID(OfflineAlgorithm, StableSAC):
         if who in ("expert", "both"):
             super().check_ages([age for age in ages if who == "expert" or age < self.policy.expert_ages])
 
-    def distill(self, width: int = 256, **settings: Any) -> float:
+    def distill(self, width: int = 256, progress_bar: bool = False, **settings: Any) -> float:
         """Train a student: a plain network that answers as the planner does at temperature 0, much faster.
 
         It learns from the planner's answers to observations of the replay, at every age, and to those that it visits
-        itself in the training environment. ``save`` keeps it. To use it, ``set_answer("student")``. It does not change
-        where the planner is trained again.
+        itself in the training environment, within ten minutes on one core. ``save`` keeps it. To use it,
+        ``set_answer("student")``. It does not change where the planner is trained again.
 
         :param width: of its two hidden layers
+        :param progress_bar: show one
         :param settings: fields of :class:`~sb3_said.said.student.Distillation`, such as ``n_labels`` or ``q_weight``
         :return: root mean square of its error over held-out answers of the planner, in actions in [-1, 1]
         :raises ValueError: without a trained planner, or without both a replay and an environment
@@ -230,7 +231,7 @@ class SAID(OfflineAlgorithm, StableSAC):
             th.manual_seed(self.seed or 0)
             self.policy.make_student(width)
             try:
-                error = distill(self, config)
+                error = distill(self, config, progress_bar)
             except BaseException:
                 self.policy.student = before
                 raise

@@ -10,6 +10,7 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 from torch.nn import functional as F
+from tqdm.auto import tqdm
 
 from sb3_said.delays.space import KEYS, check_spaces
 from sb3_said.sac.extractors import StateAugmentedExtractor
@@ -114,16 +115,19 @@ class _Rows:
         return _Rows(*(part[rows] for part in vars(self).values()))
 
 
-def distill(model: SAID, config: Distillation) -> float:
+def distill(model: SAID, config: Distillation, progress_bar: bool = False) -> float:
     """Train the policy's student, and return its error: the root mean square over labels that it did not learn from.
 
     :param model: with a trained planner, and a replay or an environment; without a replay, the planner's own visits
         take its place
+    :param progress_bar: show one
     """
     model.policy.set_training_mode(False)
     student, generator = model.policy.student, th.Generator().manual_seed(model.seed or 0)
     if model.replay_buffer is not None and model.replay_buffer.size() > 0:
-        parts = [_replayed(model, config, generator) for _ in range(-(-config.n_labels // LABELLED_AT_ONCE))]
+        n_parts = -(-config.n_labels // LABELLED_AT_ONCE)
+        bar = tqdm(range(n_parts), desc="the planner's answers", disable=not progress_bar)
+        parts = [_replayed(model, config, generator) for _ in bar]
         rows = sum(parts[1:], parts[0])[: config.n_labels]
     else:
         rows = _visited(model, "planner", config.n_labels, generator)
@@ -133,7 +137,7 @@ def distill(model: SAID, config: Distillation) -> float:
     optimizer = th.optim.Adam(student.network.parameters(), lr=config.learning_rate)
     schedule = th.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, config.gradient_steps)
     rounds = config.rounds if model.env is not None and config.own_steps > 0 else 0
-    for k in range(config.gradient_steps):
+    for k in tqdm(range(config.gradient_steps), desc="student", disable=not progress_bar):
         if k > 0 and rounds and k % -(-config.gradient_steps // (rounds + 1)) == 0:
             rows = rows + _visited(model, "student", -(-config.own_steps // rounds), generator)
         drawn = th.randint(len(rows.inputs), (config.batch_size,), generator=generator).to(rows.inputs.device)

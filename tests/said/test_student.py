@@ -156,6 +156,16 @@ def test_settings_that_cannot_be_are_refused_and_the_student_stays(taught, setti
     assert taught.policy.student is before and taught.student_width == 32
 
 
+def test_a_bar_shows_labels_and_updates(taught, capsys):
+    before = taught.policy.student
+    try:
+        taught.distill(**{**QUICK, "gradient_steps": 30}, progress_bar=True)
+    finally:
+        taught.policy.student = before
+    shown = capsys.readouterr().err
+    assert "the planner's answers: 100%" in shown and "student: 100%" in shown and "30/30" in shown
+
+
 def test_who_is_not_there_cannot_answer():
     model = make()
     assert model.policy.answers == ["expert"]
