@@ -20,27 +20,13 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from what_diffusion_buys import make_env, open_run
+from what_diffusion_buys import make_env, open_run, open_with_log
 
 from sb3_said import SAID
 from sb3_said.evaluation import collect_observations, confidence_interval, measure_latency, rollout
 from sb3_said.files.atomic import write_json
 from sb3_said.realtime import OnnxModel
 from sb3_said.said.export import export
-from sb3_said.zoo.runs import load_run
-
-
-def open_with_log(agent: Path, log: Path) -> SAID:
-    """Return an agent whose replay is a log of its task.
-
-    :raises ValueError: when it is no SAID agent, or the log not of its task
-    """
-    run = load_run(agent, device="cpu")
-    if not isinstance(run.model, SAID):
-        raise ValueError(f"{agent} is a {type(run.model).__name__}; give a SAID agent.")
-    run.model.set_env(run.make_env())
-    run.model.take_dataset(log)
-    return run.model
 
 
 def play(model: SAID, args: argparse.Namespace) -> dict[str, Any]:

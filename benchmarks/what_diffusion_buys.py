@@ -2,7 +2,8 @@
 
     python benchmarks/what_diffusion_buys.py RUN --updates 8000 --seeds 1 2 3 --delays 0 4 8 16 --json rows.json
 
-RUN is the folder of a SAID run with its checkpoint, which holds the replay; a run that has not ended will do.
+RUN is the folder of a SAID run with its checkpoint, which holds the replay; a run that has not ended will do. Or it is
+any SAID agent with a log of its task in the replay's place (--log, such as scripts/collect.py makes).
 
 expert, last         the expert's actor as it is
 expert, average      the average of its weights
@@ -16,6 +17,7 @@ chosen by Q          the best of these candidates by the mean min Q(s, a) of the
 chosen by V          the same by V(s), learned on the replay by implicit Q-learning with two steps for each update
 paper                SAID with the paper's settings (Tables 3 and 4); seconds a decision on a CPU
 paper, 2 steps       the same planner in two denoising steps, which the paper has in its appendix, a tenth of the time
+paper, temperature 0 the same planner in five steps and one candidate, as SAID decides
 
 The planner's seed decides its initial weights, its batches and those of the networks. Every row of a seed learns from
 the same batches, but the paper's, which has windows and batches of its own. A call plays what --json lacks, so the same
@@ -58,7 +60,11 @@ SETTINGS: dict[str, dict[str, Any]] = {
 }
 SETTINGS["chosen by V"] = SETTINGS["chosen by Q"]
 LEARNED = (*NETWORKS, *SETTINGS)
-PAPER = {"paper": 20, "paper, 2 steps": 2}  # denoising steps
+PAPER = {
+    "paper": {"sampling_steps": 20},
+    "paper, 2 steps": {"sampling_steps": 2},
+    "paper, temperature 0": WAYS["default"],
+}
 ROWS = (*EXPERT, *LEARNED, *PAPER)
 
 
@@ -110,6 +116,20 @@ def open_run(folder: Path) -> SAID:
         restore_agent(model, state)
     model.replay_buffer.load_state_dict(state["replay_buffer"])
     return model
+
+
+def open_with_log(agent: Path, log: Path) -> SAID:
+    """Return an agent whose replay is a log of its task.
+
+    :raises ValueError: when it is no SAID agent, or the log not of its task
+    """
+    run = load_run(agent, device="cpu")
+    if not isinstance(run.model, SAID):
+        raise ValueError(f"{agent} is a {type(run.model).__name__}; give a SAID agent.")
+    run.model.set_env(run.make_env())
+    run.model.take_dataset(log)
+    run.model.planner_newest_fraction = 1.0  # no step of a log is newer than another
+    return run.model
 
 
 def make_env(model: SAID, delay: int) -> gym.Env[Any, Any]:
@@ -169,8 +189,9 @@ def players(model: SAID, rows: list[str], args: argparse.Namespace) -> Iterator[
             policy.set_value("critics")
         if any(f"{row}/{seed}" in rows for row in PAPER):
             train(model, PlannerConfig.paper(mask=preset.mask, ema_warmup=True), args.updates, seed)
-            for row, steps in PAPER.items():
-                model.set_planner(sampling_steps=steps)
+            papers = policy.planner.config
+            for row, how in PAPER.items():
+                policy.planner.config = replace(papers, **how)
                 with policy.answering("planner"):
                     yield row, seed, model
 
@@ -179,6 +200,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     """Train, play, print, write, and return the numbers."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("run", type=Path, metavar="RUN")
+    p.add_argument("--log", type=Path, help="dataset to learn from")
     p.add_argument("--updates", type=int, default=8_000, help="of each planner, and of the networks beside it")
     p.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3], help="of the planners")
     p.add_argument("--rows", nargs="+", choices=ROWS, default=list(ROWS), metavar="ROW")
@@ -190,7 +212,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     p.add_argument("--json", type=Path, required=True, help="file of the numbers, read and written")
     args = p.parse_args(argv)
     th.set_num_threads(args.num_threads)
-    model = open_run(args.run)
+    model = open_run(args.run) if args.log is None else open_with_log(args.run, args.log)
     settings = {"steps": model.num_timesteps, "updates": args.updates, "episodes": args.episodes}
     document = json.loads(args.json.read_text()) if args.json.exists() else {**settings, "returns": {}}
     if given := {key: document[key] for key in settings if document[key] != settings[key]}:
