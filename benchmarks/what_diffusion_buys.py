@@ -15,7 +15,8 @@ SAID                 SAID as its preset decides: in five steps at temperature 0
 weighed              SAID whose critics weigh the candidates of two steps at temperature 1
 chosen by Q          the best of these candidates by the mean min Q(s, a) of the steps planned after the decision
 chosen by V          the same by V(s), learned on the replay by implicit Q-learning with two steps for each update
-paper                SAID with the paper's settings (Tables 3 and 4); seconds a decision on a CPU
+paper                SAID with the paper's settings (Tables 3 and 4), but for its averaging, which is warmed up so that
+                     few updates count, and its precision, which is the preset's; seconds a decision on a CPU
 paper, 2 steps       the same planner in two denoising steps, which the paper has in its appendix, a tenth of the time
 paper, temperature 0 the same planner in five steps and one candidate, as SAID decides
 
@@ -188,7 +189,12 @@ def players(model: SAID, rows: list[str], args: argparse.Namespace) -> Iterator[
                     yield row, seed, model
             policy.set_value("critics")
         if any(f"{row}/{seed}" in rows for row in PAPER):
-            train(model, PlannerConfig.paper(mask=preset.mask, ema_warmup=True), args.updates, seed)
+            train(
+                model,
+                PlannerConfig.paper(mask=preset.mask, ema_warmup=True, precision=preset.precision),
+                args.updates,
+                seed,
+            )
             papers = policy.planner.config
             for row, how in PAPER.items():
                 policy.planner.config = replace(papers, **how)
