@@ -23,10 +23,6 @@ def listen(port, loop):
             print(f"Dropped {line!r}: {error}", file=sys.stderr)
 
 
-def send(port, number, action):
-    port.write(f"{number} {' '.join(f'{x:.6f}' for x in action)}\n".encode())
-
-
 def main(agent, device, period):
     with ModelProcess(partial(SAID.load, agent, device="cpu")) as model, ControlLoop(model, period) as loop:
         with serial.Serial(device, 115200, timeout=1) as port:
@@ -34,9 +30,9 @@ def main(agent, device, period):
             try:
                 for now in ticks(period):
                     action = loop.act(now)
-                    send(port, loop.n_sent, action)
+                    port.write(f"{loop.n_sent} {' '.join(map(str, action))}\n".encode())
             finally:  # Ctrl-C, or no answer for too long
-                send(port, loop.n_sent + 1, loop.safe_action)
+                port.write(f"{loop.n_sent + 1} {' '.join(map(str, loop.safe_action))}\n".encode())
                 print(loop.statistics())
 
 

@@ -51,8 +51,7 @@ class Asking:
         dummy = Request(-1, 0, 0, np.zeros(state_shape, np.float32), history, self.max_delay)
         if hasattr(self.model, "warmup"):
             self.model.warmup()
-        else:
-            self.answer(dummy)
+        self.answer(dummy)  # a ModelProcess has a warmup() whatever its model has
         return self.answer(dummy)[1]
 
 

@@ -7,7 +7,6 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -139,7 +138,7 @@ class ControlLoop:
     def statistics(self) -> LoopStatistics:
         """Return a copy of what was counted so far."""
         with self._changed:
-            return deepcopy(self._statistics)
+            return self._statistics.copy()
 
     def reset(self, now: float | None = None) -> None:
         """Begin an episode: nothing has been sent, seen or planned.
@@ -250,15 +249,13 @@ class ControlLoop:
         ledger, counted = self._ledger, self._statistics
         counted.steps += 1
         if ledger.observation is not None:
-            counted.ages[ledger.age] += 1
+            counted.count(age=ledger.age)
         if n_missing > 0:
             kind = "held" if n_missing <= ledger.hold_steps else "safe"
             name = f"{kind if ledger.is_answered else 'waiting'}_steps"
             setattr(counted, name, getattr(counted, name) + 1)
         if ledger.n_sent > 0:
-            gap = (now - self._acted) / self.period
-            counted.gaps[round(gap, 3)] += 1
-            counted.overruns += gap > 1.5
+            counted.count(gap=(now - self._acted) / self.period)
 
     def _work(self) -> None:
         """Answer until closed: the worker's thread."""
@@ -301,7 +298,7 @@ class ControlLoop:
         if request.episode != ledger.episode:
             return
         took = ledger.n_sent - request.n_sent
-        self._statistics.answer_steps[took] += 1
+        self._statistics.count(answer_steps=took)
         self._took.append(took)
         self._expect()
         if self.count_latency:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+#: Larger ages, answer times and gaps are counted as this many steps or periods.
+LARGEST_COUNTED = 1_000
 #: What is reported of each distribution; the last is the maximum.
 PERCENTILES = {"p50": 0.50, "p95": 0.95, "p99": 0.99, "max": 1.0}
 
@@ -32,11 +34,11 @@ class LoopStatistics:
     """Counts of a :class:`~sb3_said.realtime.ControlLoop`, over all episodes since it was made. Memory is bounded."""
 
     ages: Counter[int] = field(default_factory=Counter)
-    """of the newest observation when an action was sent, in control steps"""
+    """of the newest observation when an action was sent, in control steps; 1,000 stands for all above, as below"""
     answer_steps: Counter[int] = field(default_factory=Counter)
     """actions that were sent while an answer was made"""
     gaps: Counter[float] = field(default_factory=Counter)
-    """from one action to the next, in periods, to a thousandth"""
+    """from one action to the next, in periods, to a thousandth below 2 and to whole ones above"""
     steps: int = 0
     """actions sent"""
     overruns: int = 0
@@ -51,6 +53,20 @@ class LoopStatistics:
     """answers after the step that they were planned for; a plan's later actions serve"""
     stale_observations: int = 0
     """observations that were no younger than the one at hand: repeated by a frozen sensor, or overtaken"""
+
+    def count(self, age: int | None = None, answer_steps: int | None = None, gap: float | None = None) -> None:
+        """Count one of each that is given."""
+        if age is not None:
+            self.ages[min(age, LARGEST_COUNTED)] += 1
+        if answer_steps is not None:
+            self.answer_steps[min(answer_steps, LARGEST_COUNTED)] += 1
+        if gap is not None:
+            self.gaps[round(gap, 3) if gap < 2 else float(round(min(gap, LARGEST_COUNTED)))] += 1
+            self.overruns += gap > 1.5
+
+    def copy(self) -> LoopStatistics:
+        """Return a copy, which further counting does not change."""
+        return replace(self, ages=Counter(self.ages), answer_steps=Counter(self.answer_steps), gaps=Counter(self.gaps))
 
     def to_dict(self) -> dict[str, float]:
         """Return the counts, and percentiles of what was met, such as ``age_p95``, in JSON types."""

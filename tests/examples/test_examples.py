@@ -104,7 +104,8 @@ def ros(monkeypatch: pytest.MonkeyPatch) -> Any:
         "rclpy", init=lambda signal_handler_options: None, shutdown=lambda: None, spin=lambda node: None, nodes=[]
     )
     message = lambda data: SimpleNamespace(data=data)  # noqa: E731
-    monkeypatch.setattr(Node, "given", {"period": 0.5, "safe_action": [-1.0], "action_topic": "/arm", "agent": "a.zip"})
+    topics = {"action_topic": "/arm", "observation_topic": "/joints"}
+    monkeypatch.setattr(Node, "given", {"period": 0.5, "safe_action": [-1.0], "agent": "a.zip", **topics})
     example = load(
         "ros2_node",
         monkeypatch,
@@ -127,7 +128,7 @@ def test_the_ros_node_observes_acts_and_tells_that_it_lives(ros: Any) -> None:
     node = ros.ControlNode()
     assert node.model.load.args == ("a.zip",) and node.loop.period == 0.5
     now = time.time_ns()
-    node.subscribed["/joint_states"](joint_state([0.5], [0.25], now - 10_000_000))
+    node.subscribed["/joints"](joint_state([0.5], [0.25], now - 10_000_000))
     assert node.loop.wait(60)
     node.timers[0.5]()
     np.testing.assert_array_equal(node.model.asked[-1]["observation"], np.float32([0.5, 0.25]))
@@ -135,11 +136,11 @@ def test_the_ros_node_observes_acts_and_tells_that_it_lives(ros: Any) -> None:
     assert 0.01 <= time.monotonic() - node.captured < 60
     for is_frozen, age in ((True, 1), (True, 2), (False, 0)):
         stamp = now - 10_000_000 if is_frozen else time.time_ns()
-        node.subscribed["/joint_states"](joint_state([0.5], [0.25], stamp))
+        node.subscribed["/joints"](joint_state([0.5], [0.25], stamp))
         assert node.loop._ledger.age == age
         if age:
             node.timers[0.5]()
-    node.subscribed["/joint_states"](joint_state([np.nan], [0.25], time.time_ns()))
+    node.subscribed["/joints"](joint_state([np.nan], [0.25], time.time_ns()))
     assert "Observation dropped" in node.logged[0] and "finite" in node.logged[0]
     node.timers[1.0]()
     assert "steps 3" in node.published["~/heartbeat"][0] and "stale 2" in node.published["~/heartbeat"][0]
@@ -154,7 +155,7 @@ def test_the_ros_node_ends_with_the_safe_action(end: str, ros: Any, monkeypatch:
         nodes.append(node)
         node.timers[0.5]()  # sends nothing yet
         assert node.published["/arm"] == []
-        node.subscribed["/joint_states"](joint_state([np.nan], [0.0], time.time_ns()))
+        node.subscribed["/joints"](joint_state([np.nan], [0.0], time.time_ns()))
         node.timers[0.5]()  # the robot speaks, if nonsense
         if end == "SIGTERM":
             os.kill(os.getpid(), signal.SIGTERM)
@@ -204,7 +205,7 @@ class Port:
 
 def test_the_serial_robot(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     example = load("serial_robot", monkeypatch, module("serial", Serial=Port))
-    assert len((EXAMPLES / "serial_robot.py").read_text().splitlines()) <= 50
+    assert len((EXAMPLES / "serial_robot.py").read_text().splitlines()) <= 40
     with pytest.raises(KeyboardInterrupt):
         example.main("agent.zip", "/dev/robot", 0.01)
     (port,) = Port.opened

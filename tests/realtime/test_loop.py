@@ -2,6 +2,7 @@
 
 import threading
 import time
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -246,6 +247,19 @@ def test_statistics_are_a_dict_a_line_and_rows_of_a_logger():
     loop.act(6)
     assert found.steps == 5  # a copy
     assert "age -/-/-/-" in str(in_steps(Recorder(TASK, 4)).statistics())
+
+
+def test_a_sensor_that_is_frozen_for_long_and_any_gap_take_bounded_memory():
+    loop = in_steps(Recorder(TASK, 4))
+    loop.observe(ZEROS, n_executed=0)
+    now = 0.0
+    for t in range(5_000):
+        now += 1 + t  # no two gaps alike
+        loop.act(now)
+    found = loop.statistics()
+    assert found.steps == 5_000 and found.ages.total() == 5_000 and found.gaps.total() == 4_999
+    assert found.ages == Counter({**dict.fromkeys(range(1_000), 1), 1_000: 4_000})
+    assert len(found.gaps) <= 1_001 and found.to_dict()["gap_max"] == 1_000
 
 
 def test_statistics_go_to_tensorboard(tmp_path):

@@ -61,5 +61,16 @@ class Sum:
         return np.float32(observation.sum(1, keepdims=True) + self.offset), None
 
 
+class Cold(Sum):
+    """Takes a second for its first answer, as one does that compiles or reads from a disk."""
+
+    is_warm = False
+
+    def predict(self, observation: np.ndarray, deterministic: bool = False) -> tuple[np.ndarray, None]:
+        time.sleep(0 if self.is_warm else 1)
+        self.is_warm = True
+        return super().predict(observation)
+
+
 def fail() -> None:
     raise FileNotFoundError("no such agent")
