@@ -28,6 +28,25 @@ SECONDS = 600.0  # of training between two checkpoints, at least
 BYTES_A_SECOND = 500_000  # that checkpoints write at most, over the whole training
 
 
+class CheckpointClock:
+    """Says when a checkpoint is due: ten minutes after the last, and later where its file is large.
+
+    :param path: of the checkpoint
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.wait()
+
+    def wait(self) -> None:
+        """Begin to wait for the next."""
+        size = self.path.stat().st_size if self.path.exists() else 0
+        self._due = time.monotonic() + max(SECONDS, size / BYTES_A_SECOND)
+
+    def is_due(self) -> bool:
+        return time.monotonic() >= self._due
+
+
 class TrainingCheckpointCallback(BaseCallback):
     """Write everything that a run needs to go on, from time to time and when learning ends.
 
@@ -55,18 +74,18 @@ class TrainingCheckpointCallback(BaseCallback):
         self.save_freq = save_freq
         self.should_stop = should_stop or (lambda: False)
         self._tried_at = self._saved_at = -1  # num_timesteps
-        self._due = 0.0
+        self._clock = CheckpointClock(self.path)
 
     def _on_training_start(self) -> None:
         self._tried_at = self._saved_at = self.model.num_timesteps
-        self._wait()
+        self._clock.wait()
 
     def _on_rollout_start(self) -> None:
         # Here, and not in on_step, the replay buffer holds every step taken and the updates have caught up with it.
         if self.should_stop():
             raise KeyboardInterrupt
         if self.save_freq is None:
-            is_due = time.monotonic() >= self._due
+            is_due = self._clock.is_due()
         else:
             is_due = self.model.num_timesteps - self._tried_at >= self.save_freq
         if is_due:
@@ -99,12 +118,8 @@ class TrainingCheckpointCallback(BaseCallback):
                     "goes on; make room, or a crash loses what was learned since the last one.",
                     stacklevel=2,
                 )
-            self._wait()
+            self._clock.wait()
         return self._saved_at == self._tried_at
-
-    def _wait(self) -> None:
-        size = self.path.stat().st_size if self.path.exists() else 0
-        self._due = time.monotonic() + max(SECONDS, size / BYTES_A_SECOND)
 
 
 def check_finite(state: dict[str, Any], path: Path) -> None:

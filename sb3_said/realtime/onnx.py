@@ -39,8 +39,13 @@ class OnnxModel:
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[np.ndarray, None]:
-        """Answer a batch (B, ...) with actions (B, act_dim), in the units of the action space."""
+        """Answer a batch (B, ...) with actions (B, act_dim), in the units of the action space.
+
+        :raises ValueError: where an answer is not finite
+        """
         parts = observation if isinstance(observation, dict) else {"observation": observation}
         given = {key: np.asarray(parts[key], np.float32) for key in self._keys}
         action: np.ndarray = self._session.run(["action"], given)[0]
+        if not np.isfinite(action).all():
+            raise ValueError(f"The graph answers {action}, which is not finite; look at the observation: {given}.")
         return action, None

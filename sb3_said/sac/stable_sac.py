@@ -111,11 +111,11 @@ class StableSAC(DelayedSAC):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)  # refuses what is NaN
         if self.policy.return_scale is not None:
             self._running_returns = self.gamma * self._running_returns + reward
             self.policy.return_scale.update(self._running_returns)
             self._running_returns = self._running_returns * (1 - dones)
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def _look_at_states(self) -> None:
         """Take the statistics of the states in replay, unless they are hardly more than last time."""

@@ -282,7 +282,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         progress_bar: bool = False,
         log_interval: int = 500,
         eval_interval: int = 2_000,
-        save_interval: int = 1_000,
+        save_interval: int | None = None,
         trial_episodes: int | None = None,
         should_stop: Callable[[], bool] | None = None,
     ) -> None:
@@ -299,7 +299,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         :param progress_bar: show one
         :param log_interval: updates between two rows of losses in the log
         :param eval_interval: updates between two measurements of the held-out errors, beside the regression's
-        :param save_interval: updates between two checkpoints
+        :param save_interval: updates between two checkpoints; by default ten minutes, and longer where they are large
         :param trial_episodes: ``planner_trial_episodes`` by default; none are played where there is no environment
         :param should_stop: asked after every update; where it says so, a checkpoint is written and the training ends
         :raises KeyboardInterrupt: when ``should_stop`` has ended the training
@@ -358,7 +358,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         progress_bar: bool = False,
         folder: str | Path | None = None,
         eval_interval: int = 2_000,
-        save_interval: int = 1_000,
+        save_interval: int | None = None,
         should_stop: Callable[[], bool] | None = None,
     ) -> SelfSAID:
         """Train the planner, and V(s) beside it, on logs of a task without delay (paper, Algorithm 2).
@@ -375,7 +375,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         :param progress_bar: show one
         :param folder: keep a checkpoint there, and continue from it if it is of the same training
         :param eval_interval: updates between two measurements of the held-out errors
-        :param save_interval: updates between two checkpoints
+        :param save_interval: updates between two checkpoints; by default ten minutes, and longer where they are large
         :param should_stop: as of :meth:`train_planner`
         :raises KeyboardInterrupt: when ``should_stop`` has ended the training
         :raises ValueError: as ``load_dataset`` and :meth:`train_planner` do

@@ -13,7 +13,7 @@ from stable_baselines3.common.logger import Logger
 from tqdm.auto import tqdm
 
 from sb3_said.files.archive import load_tree, readable, save_tree
-from sb3_said.files.checkpoint import checksum, evaluations_of, restore_evaluations
+from sb3_said.files.checkpoint import CheckpointClock, checksum, evaluations_of, restore_evaluations
 from sb3_said.offline.iql import IQL
 from sb3_said.planner.trainer import PlannerTrainer, worse_than_regression
 
@@ -32,7 +32,7 @@ class PlannerTraining:
     :param folder: keep a checkpoint there, and continue from it if it is of the same training
     :param log_interval: updates between two rows of losses in the log
     :param eval_interval: updates between two measurements of the held-out errors, beside the regression's
-    :param save_interval: updates between two checkpoints
+    :param save_interval: updates between two checkpoints; by default time decides, as for those of environment steps
     :param watcher: whose ``EvalCallback`` evaluations the checkpoint keeps, too
     :raises SavedFileError: when the checkpoint is damaged, or of a training with other settings
     """
@@ -46,18 +46,18 @@ class PlannerTraining:
         folder: str | Path | None = None,
         log_interval: int = 500,
         eval_interval: int = 2_000,
-        save_interval: int = 1_000,
+        save_interval: int | None = None,
         watcher: BaseCallback | None = None,
     ):
         self.model, self.trainer, self.values, self.row = model, trainer, values, row
         self.log_interval, self.eval_interval, self.save_interval = log_interval, eval_interval, save_interval
-        self.checkpoint = None if folder is None else Path(folder) / PLANNER_CHECKPOINT_NAME
+        self._clock = None if folder is None else CheckpointClock(Path(folder) / PLANNER_CHECKPOINT_NAME)
         self.watcher = watcher
         self._data = {"num_timesteps": model.num_timesteps, "replay": checksum(model)}
         self._value_losses: dict[str, th.Tensor] = {}  # of the last update; read at log times only
-        if self.checkpoint is not None and self.checkpoint.exists():
-            state = load_tree(self.checkpoint)
-            with readable(self.checkpoint, explained=(ValueError,)):
+        if self._clock is not None and self._clock.path.exists():
+            state = load_tree(self._clock.path)
+            with readable(self._clock.path, explained=(ValueError,)):
                 if {key: state[key] for key in self._data} == self._data:
                     trainer.load_state_dict(state["trainer"])
                     if values is not None:
@@ -89,8 +89,9 @@ class PlannerTraining:
                 bar.set_postfix(loss=self._log_row(done % self.eval_interval == 0 or is_end))
             goes_on = on_step is None or on_step(done)  # first: a checkpoint keeps what callbacks counted
             outcome = "stopped" if should_stop is not None and should_stop() else "done"
-            if self.checkpoint is not None and (done % self.save_interval == 0 or is_end or outcome == "stopped"):
-                self._save_or_warn(self.checkpoint)
+            clock = self._clock
+            if clock is not None and (self._is_due(clock, done) or is_end or outcome == "stopped"):
+                self._save_or_warn(clock)
             return outcome == "done" and goes_on
 
         with tqdm(total=total, initial=trainer.n_updates, desc="planner", disable=not progress_bar) as bar:
@@ -123,6 +124,9 @@ class PlannerTraining:
             log.record(key, value)
         log.dump(self.row(self.trainer.n_updates))
 
+    def _is_due(self, clock: CheckpointClock, n_updates: int) -> bool:
+        return clock.is_due() if self.save_interval is None else n_updates % self.save_interval == 0
+
     def _train_values(self) -> None:
         if self.values is None:
             return
@@ -144,15 +148,16 @@ class PlannerTraining:
             )
         return losses["planner/loss"]
 
-    def _save_or_warn(self, checkpoint: Path) -> None:
+    def _save_or_warn(self, clock: CheckpointClock) -> None:
         """Write a checkpoint; a full disk is no reason to lose the planner itself."""
         values = None if self.values is None else self.values.state_dict()
         state = {**self._data, "trainer": self.trainer.state_dict(), "values": values}
         try:
-            save_tree(checkpoint, {**state, "evaluations": evaluations_of(self.watcher)})
+            save_tree(clock.path, {**state, "evaluations": evaluations_of(self.watcher)})
         except OSError as error:
             warnings.warn(
-                f"The planner's checkpoint could not be written to {checkpoint} ({error}). Training goes on, and the "
+                f"The planner's checkpoint could not be written to {clock.path} ({error}). Training goes on, and the "
                 "agent keeps its planner; make room, so that it can be saved.",
                 stacklevel=6,
             )
+        clock.wait()

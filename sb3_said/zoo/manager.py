@@ -48,6 +48,14 @@ for _name, (_class, _) in ALGORITHMS.items():
     HYPERPARAMS_CONVERTER[_name] = HYPERPARAMS_CONVERTER["sac"]
 
 
+def with_given(settings: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+    """Return settings with those of ``-params`` in their place; of ``planner_kwargs``, each by itself."""
+    planners = [each.get("planner_kwargs") for each in (settings, given)]
+    if all(isinstance(each, dict) for each in planners):
+        given = {**given, "planner_kwargs": {**planners[0], **planners[1]}}  # type: ignore[dict-item]  # they are dicts
+    return {**settings, **given}
+
+
 @dataclass(frozen=True)
 class Run:
     """What our command line adds to rl_zoo3's.
@@ -113,12 +121,12 @@ class DelayedExperimentManager(ExperimentManager):
             self._set_folder(run.resume)
             run.record.require(*(set(run.record.missing) - {*given}))
             run.record.check_hyperparams()
-            self.custom_hyperparams = {**run.record.hyperparams, **given}
+            self.custom_hyperparams = with_given(run.record.hyperparams, given)
             self.env_kwargs = {**run.record.env_kwargs, **self.env_kwargs}
             self.eval_env_kwargs = {**run.record.eval_env_kwargs, **self.eval_env_kwargs}
         else:
             overrides = preset_overrides(self.config, run.preset, env_id, run.delay, run.max_delay, run.dataset)
-            self.custom_hyperparams = {**overrides, **ALGORITHMS[algo][1], **given}
+            self.custom_hyperparams = with_given({**overrides, **ALGORITHMS[algo][1]}, given)
 
     def release(self) -> None:
         """Let other processes train in the run's folder."""

@@ -14,8 +14,6 @@ from sb3_said.offline import OfflineAlgorithm
 from sb3_said.said import SAID
 from sb3_said.zoo.manager import DelayedExperimentManager, Run
 
-SAVE_INTERVAL = 1_000  # updates of a planner between two checkpoints
-
 
 class OfflineExperimentManager(DelayedExperimentManager):
     """The manager for ``--dataset``. Steps are gradient steps, those of the planner in SAID.
@@ -72,8 +70,7 @@ class OfflineExperimentManager(DelayedExperimentManager):
 
     def _learn(self, model: Any, steps: int, **how: Any) -> None:
         if isinstance(model, SAID):
-            save_interval = self.run.checkpoint_freq or SAVE_INTERVAL
-            how |= {"folder": self.folder, "should_stop": self.stopping, "save_interval": save_interval}
+            how |= {"folder": self.folder, "should_stop": self.stopping, "save_interval": self.run.checkpoint_freq}
             how["log_interval"] = how["log_interval"] or steps  # one row, at the end
         model.learn_offline(None, steps, **how)
 

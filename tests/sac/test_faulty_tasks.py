@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+import torch as th
 from gymnasium import spaces
 from small_agent import make, same_replay
 from small_task import Drift
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_said import DelayedObservationWrapper, DelayedSAC
+from sb3_said import DelayedObservationWrapper, DelayedSAC, StableSAC
 from sb3_said.files.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback, restore_training
 
 FAULTY_STEP = 15  # of all steps, in the second episode
@@ -122,16 +123,18 @@ NOT_FINITE = {
 
 
 @pytest.mark.filterwarnings("ignore:overflow encountered in cast:RuntimeWarning")  # where the task's 1e300 is stored
+@pytest.mark.parametrize("cls", [DelayedSAC, StableSAC])
 @pytest.mark.parametrize("make_task", [Faulty, wrapped])
 @pytest.mark.parametrize("fault", NOT_FINITE)
-def test_what_is_not_finite_ends_learning_with_the_environments_number(fault, make_task):
+def test_what_is_not_finite_ends_learning_with_the_environments_number(fault, make_task, cls):
     breaks, part = NOT_FINITE[fault], "reward" if "reward" in fault else "observation after the action"
     envs = [make_task, lambda: make_task(breaks, from_step=FAULTY_STEP)]
-    model = make(DummyVecEnv(envs), DelayedSAC)
+    model = make(DummyVecEnv(envs), cls)
     with pytest.raises(ValueError, match=f"The {part} of environment 1 is not finite.*VecCheckNan"):
         model.learn(60)
     assert model.replay_buffer.size() == FAULTY_STEP - 1
     assert np.isfinite(model.replay_buffer.rewards).all() and np.isfinite(model.replay_buffer.observations).all()
+    assert all(th.isfinite(value).all() for value in model.policy.state_dict().values())
 
 
 @pytest.mark.parametrize("make_task", [Faulty, wrapped])

@@ -12,10 +12,12 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import KVWriter, Logger
 
 from sb3_said import SAID, DelayedObservationWrapper, PlannerTrainingCallback
+from sb3_said.files import checkpoint
 from sb3_said.files.archive import SavedFileError, load_tree, save_tree
 from sb3_said.files.checkpoint import TrainingCheckpointCallback, restore_training
 from sb3_said.planner import InpaintingPlanner
 from sb3_said.planner.trainer import PlannerTrainer
+from sb3_said.said import training
 from sb3_said.said.training import PLANNER_CHECKPOINT_NAME
 
 PLANNER = {"d_model": 32, "depth": 1, "horizon": 3, "batch_size": 16, "sampling_steps": 2, "n_candidates": 3}
@@ -346,6 +348,29 @@ def test_a_resumed_run_loses_and_repeats_no_training(tmp_path, trainings, save_f
     # or beside it, in the planner's own.
     assert begun(trainings) == [n for n in (50, 100, 120) if n > at or (n == at and n not in before)]
     assert resumed.policy.planner_updates == 6
+
+
+def test_the_planners_checkpoints_are_spread_by_time_and_size(tmp_path, monkeypatch):
+    """Ten minutes apart, and 2,000 s apart once the file has a gigabyte; an update takes 100 s."""
+    written, now = [], [0.0]
+
+    def save(path, state):
+        written.append(now[0])
+        with open(path, "wb") as file:
+            file.truncate(10**9 if now[0] > 1_500 else 10)
+
+    monkeypatch.setattr(training, "save_tree", save)
+    monkeypatch.setattr(checkpoint.time, "monotonic", lambda: now[0])
+    model = make().learn(40)
+
+    def pass_time(trainer):
+        now[0] += 100.0
+        return original(trainer)
+
+    original = PlannerTrainer.step
+    monkeypatch.setattr(PlannerTrainer, "step", pass_time)
+    model.train_planner(60, folder=tmp_path)
+    assert written == [600, 1200, 1800, 3800, 5800, 6000]
 
 
 def test_a_stop_amid_one_of_several_trainings_loses_no_update(tmp_path, trainings):

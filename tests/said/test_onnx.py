@@ -46,6 +46,16 @@ def test_it_answers_as_the_agent(task, tmp_path):
     assert loaded.observation_space == model.observation_space
 
 
+def test_an_answer_that_is_not_finite_is_refused(tmp_path):
+    model = make()
+    model.policy.make_student(16)
+    export(model.policy, tmp_path / "agent.onnx")
+    obs = observe()
+    obs["observation"][3] = np.nan
+    with pytest.raises(ValueError, match="not finite; look at the observation"):
+        OnnxModel(tmp_path / "agent.onnx").predict(obs)
+
+
 def test_a_loop_runs_it_without_pytorch(tmp_path):
     model = make()
     model.policy.make_student(16)

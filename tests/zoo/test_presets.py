@@ -22,10 +22,13 @@ from sb3_said.zoo.presets import PRESETS, config_file, preset_overrides
 TASKS = ("Ant-v5", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5")
 
 
-def merged_settings(algo: str, preset: str, env_id: str, delay: Delay, log_folder: Path) -> dict[str, Any]:
+def merged_settings(
+    algo: str, preset: str, env_id: str, delay: Delay, log_folder: Path, given: dict[str, Any] | None = None
+) -> dict[str, Any]:
     """Return what the command line trains with: the preset over the file's block over the constructors' defaults."""
     run = Run(delay, preset)
-    manager = DelayedExperimentManager(run, Namespace(), algo, env_id, str(log_folder), verbose=0, eval_freq=-1)
+    how: dict[str, Any] = {"verbose": 0, "eval_freq": -1, "hyperparams": given}
+    manager = DelayedExperimentManager(run, Namespace(), algo, env_id, str(log_folder), **how)
     cls, flags = ALGORITHMS[algo]
     defaults: dict[str, Any] = {}
     for base in reversed(cls.__mro__[: cls.__mro__.index(SAC) + 1]):
@@ -95,6 +98,8 @@ def test_the_paper_preset_merged_is_the_papers_tables(env_id: str, delay: int, t
     # Section 5.1 and Algorithm 1: 5 M steps, all of which the planner learns from, once; SADR as published
     expected |= {"n_timesteps": 5e6, "buffer_size": 5_000_000, "planner_newest_fraction": 1.0}
     expected |= {"planner_train_freq": None, "relabelled_ages": 0.0}
+    expected |= {"scale_rewards": False, "normalise_states": False, "policy_delay": 1, "actor_averaging": 0.0}
+    expected |= {"ent_coef": "auto", "target_entropy": "auto", "batch_size": 256, "planner_trial_episodes": 0}
     assert {name: settings[name] for name in expected} == expected
     config = PlannerConfig(**settings["planner_kwargs"])
     assert config == PlannerConfig.paper(depth, temperature)
@@ -109,6 +114,13 @@ def test_the_paper_preset_merged_is_the_papers_tables(env_id: str, delay: int, t
     table |= {"ema_warmup": False, "warmup_steps": 0, "gradient_clip": None, "schedule": "linear"}
     assert {name: getattr(config, name) for name in table} == table
     assert not {"planner_by_delay", "base"} & {*settings, *settings["planner_kwargs"]}
+
+
+def test_what_is_given_for_the_planner_leaves_the_rest_of_the_preset(tmp_path: Path) -> None:
+    settings = merged_settings("said", "paper", "Hopper-v5", 4, tmp_path, {"planner_kwargs": {"temperature": 0.7}})
+    assert PlannerConfig(**settings["planner_kwargs"]) == PlannerConfig.paper(4, 0.7)
+    given = {"planner_kwargs": {"temperature": 0.7}, "gamma": 0.9}
+    assert merged_settings("said", "cpu", "Hopper-v5", 4, tmp_path, given)["planner_kwargs"] == {"temperature": 0.7}
 
 
 def test_the_papers_expert_is_sadr_as_published(tmp_path: Path) -> None:
