@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from measure import progress
 from what_diffusion_buys import make_env, open_run, open_with_log
 
 from sb3_said import SAID
@@ -33,6 +34,7 @@ def play(model: SAID, args: argparse.Namespace) -> dict[str, Any]:
     """Return an agent's returns by delay, and the time of its answers at the longest."""
     found: dict[str, Any] = {"returns": {}}
     for delay in args.delays:
+        progress(f"the {model.policy.who_answers} plays {args.episodes} episodes at delay {delay}")
         played = rollout(model, partial(make_env, model, delay), args.episodes, args.eval_seed, args.n_envs)
         found["returns"][str(delay)] = played.returns.tolist()
     met = collect_observations(partial(make_env, model, max(args.delays)), 100, args.eval_seed)

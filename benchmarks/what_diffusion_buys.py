@@ -38,6 +38,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
+from measure import progress
 from tqdm import tqdm
 
 from sb3_said import SAID, DelayedObservationWrapper, PlannerConfig
@@ -231,6 +232,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
         key = f"{row}/{seed}"
         for delay in args.delays if key in missing else ():
             if str(delay) not in returns.setdefault(key, {}):
+                progress(f"{key} plays {args.episodes} episodes at delay {delay}")
                 played = rollout(player, partial(make_env, model, delay), args.episodes, args.eval_seed, args.n_envs)
                 returns[key][str(delay)] = played.returns.tolist()
                 write_json(args.json, document)

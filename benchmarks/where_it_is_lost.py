@@ -32,6 +32,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
+from measure import progress
 from motivation import OldObservation
 
 from sb3_said import SAID, DelayedObservationWrapper
@@ -223,6 +224,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
         rows = document["delays"].setdefault(str(delay), {})
         for name, player in players(said, neighbours, actor).items():
             if name not in rows:
+                progress(f"{name} plays {args.episodes} episodes at delay {delay}")
                 played = rollout(player, partial(make_env, delay), args.episodes, args.eval_seed, args.episodes)
                 rows[name] = player.found(played.returns)
                 write_json(args.json, document)

@@ -58,7 +58,8 @@ def test_rows_of_a_run(files, tmp_path, capsys):
     with model.policy.answering("planner"):
         played = rollout(model, lambda: DelayedObservationWrapper(gym.make(ENV), 2, max_delay=2), 2, 10_000, 2)
     assert later["SAID"]["returns"] == played.returns.tolist()
-    assert "| true present, age 0 | " in capsys.readouterr().out
+    shown = capsys.readouterr()
+    assert "| true present, age 0 | " in shown.out and "2 held plays 2 episodes at delay 2" in shown.err
     assert script.main([*words, "--delays", "0", "2"]) == found
 
 

@@ -6,11 +6,15 @@ from small_task import Drift
 
 
 class Mine(Drift):
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
     steps = 0  # of all instances
 
-    def __init__(self, length=12, nan_at=None, nan_in="reward", **kwargs):
+    def __init__(self, length=12, nan_at=None, nan_in="reward", render_mode=None):
         super().__init__(length)
-        self.nan_at, self.nan_in = nan_at, nan_in
+        self.nan_at, self.nan_in, self.render_mode = nan_at, nan_in, render_mode
+
+    def render(self):
+        return np.full((16, 16, 3), 10 * self.t, np.uint8)
 
     def step(self, action):
         Mine.steps += 1

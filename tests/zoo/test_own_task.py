@@ -17,7 +17,7 @@ from rl_zoo3.wrappers import TimeFeatureWrapper
 from trained_run import PLANNER, train_here
 
 from sb3_said import DelayedObservationWrapper, DelayedSAC
-from sb3_said.zoo import evaluate, manager, over_delays, train, tune
+from sb3_said.zoo import enjoy, evaluate, manager, over_delays, train, tune
 from sb3_said.zoo.record import WRAPPER
 from sb3_said.zoo.runs import load_run
 
@@ -92,9 +92,11 @@ def test_a_run_remembers_the_package_of_its_task(
         lambda: over_delays.main([str(run), *few, "--delays", "1", "--json", str(tmp_path / "over.json")]),
         lambda: tune.main([str(run), "--depths", "1", "--temperatures", "0", "--report-episodes", "2", *few]),
         lambda: train.main(["--resume", str(run), "-n", "60"]),
+        lambda: enjoy.main([str(run), "--record", str(tmp_path / "mine.gif"), "--device", "cpu"]),
     ):
         forget_mine(monkeypatch)
         play()
+    assert (tmp_path / "mine.gif").read_bytes()[:3] == b"GIF"
     assert json.loads((run / "evaluation.json").read_text())["results"][0]["lengths"] == [5, 5]
     assert f"--gym-packages mine -conf {run / 'tune' / 'best.yml'}" in capsys.readouterr().out
     alone = Path(shutil.copy(run / "Mine-v0.zip", tmp_path))
