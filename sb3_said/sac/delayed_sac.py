@@ -15,6 +15,8 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import unwrap_wrapper
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn, Schedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
@@ -171,18 +173,26 @@ class DelayedSAC(SafeSaveMixin, SAC):
 
     @contextmanager
     def borrowed_env(self) -> Iterator[VecEnv]:
-        """Hand out the training environment for steps that teach nothing: ``VecNormalize`` keeps its statistics.
+        """Hand out the training environment for steps that teach nothing.
 
-        Learning, where it goes on, begins with a new episode.
+        ``VecNormalize`` keeps its statistics, and the files of SB3's ``Monitor`` the episodes of training alone, but
+        for environments in other processes. Learning, where it goes on, begins with a new episode.
         """
         assert self.env is not None
+        envs = getattr(self.env.unwrapped, "envs", [])
+        monitors = [m for env in envs if isinstance(m := unwrap_wrapper(env, Monitor), Monitor)]
+        writers = [monitor.results_writer for monitor in monitors]
         normalizer = self._vec_normalize_env
         was_training = normalizer is not None and normalizer.training
         if normalizer is not None:
             normalizer.training = False
+        for monitor in monitors:
+            monitor.results_writer = None
         try:
             yield self.env
         finally:
+            for monitor, writer in zip(monitors, writers, strict=True):
+                monitor.results_writer = writer
             self._last_obs = None  # SB3 then resets the environments
             if normalizer is not None:
                 normalizer.training = was_training

@@ -54,6 +54,15 @@ def test_returns_are_those_of_each_who_can_answer(trained):
     assert len({returns[0] for returns in played.values()}) == 5
 
 
+def test_the_monitor_file_holds_the_training_and_not_the_trial(tmp_path):
+    env = Monitor(pendulum(), str(tmp_path / "0"))
+    model = make(env=env, planner_trial_episodes=2).learn(60)
+    trial.play_trial(model, n_episodes=1)
+    model.learn(30, reset_num_timesteps=False)
+    rows = (tmp_path / "0.monitor.csv").read_text().splitlines()[2:]
+    assert len(rows) == 4 + 2  # episodes of 15 steps
+
+
 def test_a_way_that_the_planner_already_has_is_not_played_twice_and_the_way_back_is(trained):
     own = trained.policy.planner.config
     try:
