@@ -25,11 +25,14 @@ class StateAugmentedExtractor(BaseFeaturesExtractor):
         obs_dim, (max_delay, act_dim) = observation_space["observation"].shape[0], history.shape  # type: ignore
         super().__init__(observation_space, features_dim=obs_dim + max_delay * act_dim + 1)
         self.max_delay = max_delay
+        self.register_buffer("steps_ago", th.arange(max_delay, 0, -1), persistent=False)  # (D,): k of a_{t-k}
         self.normalizer = normalizer or nn.Identity()
+
+    steps_ago: th.Tensor
 
     def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
         age = observations["delay"]  # (B, 1)
-        since = th.arange(self.max_delay, 0, -1, device=age.device) <= age  # (B, D): a_{t-k} came after s_{t-age}
+        since = self.steps_ago <= age  # (B, D): a_{t-k} came after s_{t-age}
         history = observations["action_history"] * since[..., None]  # (B, D, act_dim)
         state = self.normalizer(observations["observation"])  # (B, obs_dim)
         return th.cat([state, history.flatten(1), age / max(self.max_delay, 1)], dim=1)

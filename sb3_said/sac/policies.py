@@ -144,8 +144,8 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         if is_delayed:
             _check_delayed(arrays, self.max_delay)
         # SB3's own method cannot reshape an action history of no actions, that of max_delay 0.
-        is_batch = batches["observation"] is not None
-        tensors = {key: th.as_tensor(x if is_batch else x[None], device=self.device) for key, x in arrays.items()}
+        is_batch, device = batches["observation"] is not None, self.device  # which SB3 looks for among all parameters
+        tensors = {key: th.as_tensor(x if is_batch else x[None], device=device) for key, x in arrays.items()}
         return tensors if is_delayed else tensors["observation"], is_batch
 
     def predict(
@@ -199,7 +199,11 @@ def rows_of(observation: PyTorchObs) -> Iterator[PyTorchObs]:
     if not isinstance(observation, dict):
         yield from observation.split(1)
         return
-    for i in range(len(observation["delay"])):
+    n = len(observation["delay"])
+    if n == 1:
+        yield observation
+        return
+    for i in range(n):
         yield {key: value[i : i + 1] for key, value in observation.items()}
 
 
@@ -250,18 +254,18 @@ def _as_float32(name: str, given: Any, space: spaces.Space[Any]) -> np.ndarray:
 def _check_delayed(arrays: dict[str, np.ndarray], max_delay: int) -> None:
     """Refuse ages, actions and flags that no ``DelayedObservationWrapper`` of this ``max_delay`` hands out."""
     delay, action_history = arrays["delay"], arrays["action_history"]
-    if np.any(delay != np.round(delay)) or np.any(delay < 0) or np.any(delay > max_delay):
+    if not ((delay >= 0) & (delay <= max_delay) & (delay % 1 == 0)).all():
         raise ValueError(
             f"delay runs from {delay.min():g} to {delay.max():g}, expected whole numbers in 0..{max_delay}: "
             f"the agent was built for max_delay={max_delay}."
         )
-    if np.any(np.abs(action_history) > 1.0 + 1e-4):
+    if (np.abs(action_history) > 1.0 + 1e-4).any():
         raise ValueError(
             f"action_history has entries of size {np.abs(action_history).max():g}, expected actions scaled to [-1, 1], "
             "as DelayedObservationWrapper gives them."
         )
-    known = arrays.get("state_known", np.zeros(0))
-    if np.any((known != 0) & (known != 1)):
+    known = arrays.get("state_known")
+    if known is not None and ((known != 0) & (known != 1)).any():
         raise ValueError(
             f"state_known runs from {known.min():g} to {known.max():g}, expected 1 where a state of state_history is "
             "known and 0 elsewhere."
