@@ -42,6 +42,8 @@ from sb3_said.offline.belief import (
 )
 
 N_WINDOWS = 5_000  # held out, at most
+PLAIN: dict[str, type[LearnedBelief]] = {"rolled out": RolledOutModel, "regressed": RegressedPresent}
+PLAYERS = ["inpainted", *PLAIN, "old observation", "SAID", "cloning"]
 
 
 class OldObservation:
@@ -83,13 +85,13 @@ def train(data: Dataset, args: argparse.Namespace) -> tuple[dict[str, Belief], A
     source = data.to_replay(task.observation_space, task.action_space).window_source()
     sizes = source.obs_dim, source.act_dim, args.max_delay
     networks: dict[str, LearnedBelief] = {}
-    for name, cls in (("rolled out", RolledOutModel), ("regressed", RegressedPresent)):
+    for name in [name for name in PLAIN if name in args.players]:
         th.manual_seed(args.seed)
-        networks[name] = cls(*sizes).to(args.device)
+        networks[name] = PLAIN[name](*sizes).to(args.device)
         train_belief(networks[name], source, args.plain_steps, seed=args.seed, progress_bar=True)
 
     def clone(env: gym.Env[Any, Any]) -> BC:
-        bc = BC("MultiInputPolicy", env, seed=args.seed, device=args.device, buffer_size=10)
+        bc = BC("MultiInputPolicy", env, seed=args.seed, device=args.device, buffer_size=args.max_delay + 2)
         return bc.learn_offline(data, args.plain_steps, progress_bar=True)
 
     if args.actor is not None:
@@ -165,6 +167,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     p.add_argument("--plain-steps", type=int, help="of each plain network (default: those of the planner)")
     p.add_argument("--terminal-penalty", type=float, default=0.0, help="of an end by falling, in the planner's values")
     p.add_argument("--actor", help="run folder or .zip of an agent of the task without delay (default: BC)")
+    p.add_argument("--players", nargs="+", choices=PLAYERS, default=PLAYERS, help="whose return is measured")
     p.add_argument("--held-out", type=float, default=0.05, help="part of the episodes that no network learns from")
     p.add_argument("--episodes", type=int, default=50, help="of each return")
     p.add_argument("--n-envs", type=int, default=10)
@@ -195,7 +198,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     document["errors"] = errors(held, beliefs, args)
     show({k: [f"{x:.3f}" for x in row] for k, row in document["errors"].items()}, "error at delay", args.delays)
     players = {name: BeliefOnly(belief, actor, args.device) for name, belief in beliefs.items()} | deciders
-    table = returns(players, args)
+    table = returns({name: players[name] for name in args.players}, args)
     show({k: [str(s.mean_return) for s in row] for k, row in table.items()}, "return at delay", args.delays)
     document["returns"] = {name: [summary.to_dict() for summary in row] for name, row in table.items()}
     if reference_returns(args.env) is not None:

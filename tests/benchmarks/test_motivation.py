@@ -14,14 +14,14 @@ ENV = "InvertedPendulum-v5"
 
 @pytest.fixture(scope="module")
 def log():
-    """Episodes of random actions, of different lengths."""
+    """Episodes of small random actions, of different lengths."""
     env, rng = gym.make(ENV), np.random.default_rng(0)
     states, actions, ends, finals = [], [], [], []
     for seed in range(12):
         state, ended = env.reset(seed=seed)[0], False
         while not ended:
             states.append(state)
-            actions.append(rng.uniform(-1, 1, 1))
+            actions.append(rng.uniform(-0.1, 0.1, 1))
             state, _, ended, _, _ = env.step(3 * actions[-1])
             ends.append(ended)
         finals.append(state)
@@ -48,7 +48,7 @@ def test_it_measures_errors_and_returns_of_each_belief(log, tmp_path, capsys):
     write_dataset(log, tmp_path / "log.npz", gym.make(ENV))
     paths = ["--json", str(tmp_path / "m.json"), "--plot", str(tmp_path / "m.png"), "--folder", str(tmp_path)]
     tiny = (
-        "--gradient-steps 3 --episodes 2 --delays 0 2 --held-out 0.3 --planner-kwargs depth=1,d_model=32,batch_size=8"
+        "--gradient-steps 3 --episodes 2 --delays 0 9 --held-out 0.3 --planner-kwargs depth=1,d_model=32,batch_size=8"
     )
     made = motivation.main(["--env", ENV, "--dataset", str(tmp_path / "log.npz"), *tiny.split(), *paths])
     written = json.loads((tmp_path / "m.json").read_text())
@@ -60,4 +60,10 @@ def test_it_measures_errors_and_returns_of_each_belief(log, tmp_path, capsys):
     at_0 = {name: tuple(row[0]["returns"]) for name, row in written["returns"].items()}
     assert len({at_0[name] for name in names if name != "regressed"}) == 1
     assert (tmp_path / "m.png").read_bytes()[:4] == b"\x89PNG"
-    assert "| error at delay | 0 | 2 |" in capsys.readouterr().out
+    assert "| error at delay | 0 | 9 |" in capsys.readouterr().out
+    some = motivation.main([
+        *("--env", ENV, "--dataset", str(tmp_path / "log.npz"), *tiny.split(), "--folder", str(tmp_path)),
+        *("--players", "SAID", "inpainted"),
+    ])  # fmt: skip
+    assert list(some["errors"]) == ["inpainted", "old observation"]
+    assert some["returns"] == {name: made["returns"][name] for name in ("SAID", "inpainted")}
