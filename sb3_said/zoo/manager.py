@@ -50,9 +50,9 @@ for _name, (_class, _) in ALGORITHMS.items():
 
 def with_given(settings: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
     """Return settings with those of ``-params`` in their place; of ``planner_kwargs``, each by itself."""
-    planners = [each.get("planner_kwargs") for each in (settings, given)]
-    if all(isinstance(each, dict) for each in planners):
-        given = {**given, "planner_kwargs": {**planners[0], **planners[1]}}  # type: ignore[dict-item]  # they are dicts
+    before, now = settings.get("planner_kwargs"), given.get("planner_kwargs")
+    if isinstance(before, dict) and isinstance(now, dict):
+        given = {**given, "planner_kwargs": {**before, **now}}
     return {**settings, **given}
 
 
