@@ -1,0 +1,114 @@
+"""Agents that learned from logs, over delays and planner seeds: a table and plots beside the paper's Table 2.
+
+    python benchmarks/offline_table.py medium=results/offline/hopper-medium-0.json \\
+        mixed,DQL+SA=results/offline/hopper-mixed-dql.json --plot results/offline
+
+Each file is of motivation.py (its players, of one planner seed), or of sb3-said over-delays (one agent, which is named
+after the comma). Files of one task, set and name are seeds of the same training.
+
+plots   95 % intervals are over the episodes of all seeds together
+score   D4RL's normalised score of the mean return; in brackets the seeds' own where there are several
+kept    the return as a part of the same agent's at delay 0
+paper   what Table 2 of arXiv 2603.01553 has for SAID and DQL+SA at these delays, on D4RL's -v2 sets, of which
+        medium-replay stands beside mixed, and medium-expert beside expert: other logs, and other versions of the tasks
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_said.evaluation import plots
+from sb3_said.offline import normalized_score
+
+DELAYS = (0, 4, 8, 16)
+NAMES = {"SAID": "SAID", "inpainted": "belief-only", "cloning": "BC", "rolled out": "belief-only, rolled-out model"}
+#: (set, task) -> rows of Table 2 at delays 0, 4, 8 and 16. DQL+SA has no number at delay 0 but that of their DQL.
+PAPER: dict[tuple[str, str], dict[str, tuple[float, ...]]] = {
+    ("expert", "HalfCheetah-v5"): {"SAID": (106.2, 32.8, 4.5, 1.9), "DQL+SA": (95.9, 2.9, 2.1, 1.4)},
+    ("mixed", "HalfCheetah-v5"): {"SAID": (50.2, 34.3, 8.3, 2.1), "DQL+SA": (48.9, 0.2, 1.4, 1.3)},
+    ("medium", "HalfCheetah-v5"): {"SAID": (58.5, 45.2, 5.8, 1.5), "DQL+SA": (52.6, 2.4, 2.0, 1.3)},
+    ("expert", "Walker2d-v5"): {"SAID": (111.1, 111.1, 110.8, 106.7), "DQL+SA": (112.0, 8.1, -0.3, -0.1)},
+    ("mixed", "Walker2d-v5"): {"SAID": (95.5, 91.1, 85.6, 45.2), "DQL+SA": (99.9, 7.1, -0.1, -0.2)},
+    ("medium", "Walker2d-v5"): {"SAID": (84.4, 84.8, 84.1, 80.3), "DQL+SA": (91.2, -0.1, -0.1, -0.1)},
+    ("expert", "Hopper-v5"): {"SAID": (112.3, 111.4, 111.2, 110.3), "DQL+SA": (111.1, 4.2, 1.9, 1.0)},
+    ("mixed", "Hopper-v5"): {"SAID": (98.3, 87.5, 85.6, 90.3), "DQL+SA": (102.9, 2.7, 1.8, 2.1)},
+    ("medium", "Hopper-v5"): {"SAID": (84.6, 82.0, 83.5, 86.6), "DQL+SA": (102.0, 3.1, 2.0, 2.0)},
+}
+Seeds = dict[int, list[list[float]]]  # by delay, for each seed its returns
+
+
+def read(path: Path, name: str | None) -> tuple[str, dict[str, dict[int, list[float]]]]:
+    """Return the task of a file, and its returns by agent and delay.
+
+    :param name: of the agent of a file of over-delays
+    """
+    document = json.loads(path.read_text())
+    if "cells" not in document:
+        rows = {
+            NAMES[player]: dict(zip(document["delays"], (row["returns"] for row in summaries), strict=True))
+            for player, summaries in document["returns"].items()
+            if player in NAMES
+        }
+        return document["env"], rows
+    played = {cell["delay"]: cell["result"]["returns"] for cell in document["cells"] if cell["result"] is not None}
+    return document["env"], {name or path.stem: played}
+
+
+def table(files: list[tuple[str, str | None, Path]]) -> dict[tuple[str, str], dict[str, Seeds]]:
+    """Return by (set, task) and agent the returns of all seeds."""
+    found: dict[tuple[str, str], dict[str, Seeds]] = {}
+    for kind, name, path in files:
+        env, rows = read(path, name)
+        for agent, of_delay in rows.items():
+            seeds = found.setdefault((kind, env), {}).setdefault(agent, {})
+            for delay, returns in of_delay.items():
+                seeds.setdefault(delay, []).append(returns)
+    return found
+
+
+def show(found: dict[tuple[str, str], dict[str, Seeds]]) -> None:
+    """Print a Markdown table: a row for each set and agent."""
+    columns = [f"delay {d}" for d in DELAYS] + [f"kept at {d}" for d in DELAYS[1:]] + ["paper"]
+    print(f"| set | agent | {' | '.join(columns)} |\n|---|---|" + "---|" * len(columns))
+    for (kind, env), rows in found.items():
+        for agent, seeds in rows.items():
+            cells = []
+            for delay in DELAYS:
+                scores = [float(normalized_score(float(np.mean(returns)), env)) for returns in seeds.get(delay, [])]
+                each = f" [{', '.join(f'{score:.1f}' for score in scores)}]" if len(scores) > 1 else ""
+                cells.append(f"{np.mean(scores):.1f}{each}" if scores else "")
+            cells += [f"{np.mean(seeds[d]) / np.mean(seeds[0]):.2f}" if d in seeds else "" for d in DELAYS[1:]]
+            paper = PAPER.get((kind, env), {}).get(agent, ())
+            print(f"| {env} {kind} | {agent} | {' | '.join(cells)} | {', '.join(map(str, paper))} |")
+
+
+def main(argv: list[str] | None = None) -> dict[tuple[str, str], dict[str, Seeds]]:
+    """Print the table, draw a plot for each task and set, and return the returns."""
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("files", nargs="+", metavar="SET[,NAME]=JSON")
+    p.add_argument("--plot", type=Path, metavar="FOLDER", help="one .png for each task and set")
+    args = p.parse_args(argv)
+    files = []
+    for word in args.files:
+        key, _, path = word.partition("=")
+        kind, _, name = key.partition(",")
+        if not path:
+            p.error(f"{word} is no SET=JSON, such as medium=hopper-medium-0.json.")
+        files.append((kind, name or None, Path(path)))
+    found = table(files)
+    show(found)
+    for (kind, env), rows in found.items() if args.plot else ():
+        returns: dict[str, Any] = {
+            agent: {d: np.concatenate(x) for d, x in seeds.items()} for agent, seeds in rows.items()
+        }
+        plots.save(plots.plot_over_delays(returns, f"{env}, {kind} log")[0], args.plot / f"{env}-{kind}.png")
+    return found
+
+
+if __name__ == "__main__":
+    main()

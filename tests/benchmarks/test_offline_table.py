@@ -1,0 +1,44 @@
+"""The table of offline agents: means over seeds, scores and parts that are kept, against numbers by hand."""
+
+import json
+
+import offline_table
+import pytest
+
+
+def row(*means):
+    return [{"returns": [mean - 1, mean + 1]} for mean in means]
+
+
+@pytest.fixture
+def files(tmp_path):
+    """Two seeds of motivation.py, and an agent of over-delays that has not played delay 8."""
+    for seed, means in enumerate([(2000, 1000), (3000, 2000)]):
+        players = {"inpainted": row(500, 50), "old observation": row(1, 2), "SAID": row(*means), "cloning": row(4, 2)}
+        document = {"env": "Hopper-v5", "delays": [0, 8], "returns": players}
+        (tmp_path / f"{seed}.json").write_text(json.dumps(document))
+    cells = [{"delay": 0, "result": {"returns": [1607.0]}}, {"delay": 8, "result": None}]
+    (tmp_path / "dql.json").write_text(json.dumps({"env": "Hopper-v5", "cells": cells}))
+    return [f"medium={tmp_path}/0.json", f"medium={tmp_path}/1.json", f"medium,DQL+SA={tmp_path}/dql.json"]
+
+
+def test_seeds_are_joined_and_scored(files, tmp_path, capsys):
+    pytest.importorskip("matplotlib")
+    found = offline_table.main([*files, "--plot", str(tmp_path)])
+    rows = found["medium", "Hopper-v5"]
+    assert list(rows) == ["belief-only", "SAID", "BC", "DQL+SA"]
+    assert rows["SAID"] == {0: [[1999, 2001], [2999, 3001]], 8: [[999, 1001], [1999, 2001]]}
+    lines = {line.split(" | ")[1]: line.split(" | ") for line in capsys.readouterr().out.splitlines()[2:]}
+    low, high = -20.272305, 3234.3
+    scores = [100 * (mean - low) / (high - low) for mean in (2000, 3000)]
+    assert lines["SAID"][2] == f"{sum(scores) / 2:.1f} [{scores[0]:.1f}, {scores[1]:.1f}]"
+    assert lines["SAID"][3] == "" and lines["SAID"][7] == "0.60"  # 1,500 of 2,500
+    assert lines["SAID"][-1] == "84.6, 82.0, 83.5, 86.6 |"
+    assert lines["DQL+SA"][2] == "50.0" and lines["DQL+SA"][7] == ""
+    assert (tmp_path / "Hopper-v5-medium.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_word_without_a_file_is_refused(capsys):
+    with pytest.raises(SystemExit):
+        offline_table.main(["medium"])
+    assert "medium=hopper-medium-0.json" in capsys.readouterr().err
