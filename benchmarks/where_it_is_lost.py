@@ -12,6 +12,7 @@ data, decoded present    the action that the data has at the state nearest to th
 data, true present       the same at the true present
 actor, decoded present   --actor, a policy without delay
 actor, true present      the same
+actor, present off by x  the same, with noise of x standard deviations on every entry: what an error of that size costs
 2 held, 4 held           SAID's plan, executed for so many steps before it plans anew
 
 Beside each return stand, over all steps played: the error of the decoded present, and how far the task's state is from
@@ -45,6 +46,7 @@ from sb3_said.zoo.runs import load_run
 
 PRESENTS = "presents"  # key of the true states s_{t-D..t}
 HELD = (2, 4)
+OFF_BY = (0.05, 0.1, 0.2, 0.4)  # standard deviations of the data
 
 
 class ShowPresents(gym.Wrapper[Any, Any, Any, Any]):
@@ -188,6 +190,10 @@ def players(said: SAID, data: Neighbours, actor: Any) -> dict[str, Player]:
     if actor is not None:
         decide["actor, decoded present"] = lambda step: acts(step.plan.present)
         decide["actor, true present"] = lambda step: acts(step.true)
+        for x in OFF_BY:
+            decide[f"actor, present off by {x}"] = lambda step, x=x: acts(
+                step.true + x * data.scale * th.randn_like(step.true)
+            )
     made = {name: Player(said, how, data) for name, how in decide.items()}
     return made | {f"{n} held": Held(said, n, data) for n in HELD}
 
@@ -201,7 +207,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     p.add_argument("--delays", type=int, nargs="+", default=[4, 8])
     p.add_argument("--episodes", type=int, default=10, help="of each row and delay, side by side")
     p.add_argument("--eval-seed", type=int, default=10_000, help="reset seed of the first episode")
-    p.add_argument("--seed", type=int, default=0, help="of the data's states that are compared with each other")
+    p.add_argument("--seed", type=int, default=0, help="of noise, and of states that are compared")
     p.add_argument("--num-threads", type=int, default=1)
     p.add_argument("--json", type=Path, required=True, help="file of the numbers, read and written")
     args = p.parse_args(argv)
@@ -224,6 +230,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
         rows = document["delays"].setdefault(str(delay), {})
         for name, player in players(said, neighbours, actor).items():
             if name not in rows:
+                th.manual_seed(args.seed)
                 progress(f"{name} plays {args.episodes} episodes at delay {delay}")
                 played = rollout(player, partial(make_env, delay), args.episodes, args.eval_seed, args.episodes)
                 rows[name] = player.found(played.returns)
