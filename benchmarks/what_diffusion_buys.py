@@ -39,6 +39,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from measure import progress
+from motivation import dict_of
 from tqdm import tqdm
 
 from sb3_said import SAID, DelayedObservationWrapper, PlannerConfig
@@ -173,7 +174,7 @@ def players(model: SAID, rows: list[str], args: argparse.Namespace) -> Iterator[
     if "expert, average/None" in rows:
         with policy.answering("expert"):
             yield "expert, average", None, model
-    preset = replace(policy.planner.config, **WAYS["default"])  # whatever the run's own trial chose
+    preset = replace(policy.planner.config, **WAYS["default"], **args.planner_kwargs)  # whatever the run's trial chose
     for seed in args.seeds:
         if any(f"{row}/{seed}" in rows for row in LEARNED):
             trainer = train(model, preset, args.updates, seed)
@@ -210,6 +211,10 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     p.add_argument("--log", type=Path, help="dataset to learn from")
     p.add_argument("--updates", type=int, default=8_000, help="of each planner, and of the networks beside it")
     p.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3], help="of the planners")
+    p.add_argument(
+        "--planner-kwargs", type=partial(dict_of, "--planner-kwargs"), default={}, metavar="NAME=VALUE,...",
+        help="other settings of the planner than the run's",
+    )  # fmt: skip
     p.add_argument("--rows", nargs="+", choices=ROWS, default=list(ROWS), metavar="ROW")
     p.add_argument("--delays", type=int, nargs="+", default=[0, 4, 8, 16])
     p.add_argument("--episodes", type=int, default=20, help="of each row, seed and delay")
@@ -220,8 +225,10 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     args = p.parse_args(argv)
     th.set_num_threads(args.num_threads)
     model = open_run(args.run) if args.log is None else open_with_log(args.run, args.log)
-    settings = {"steps": model.num_timesteps, "updates": args.updates, "episodes": args.episodes}
+    settings: dict[str, Any] = {key: getattr(args, key) for key in ("updates", "episodes", "planner_kwargs")}
+    settings["steps"] = model.num_timesteps
     document = json.loads(args.json.read_text()) if args.json.exists() else {**settings, "returns": {}}
+    document.setdefault("planner_kwargs", {})  # older files have the run's settings
     if given := {key: document[key] for key in settings if document[key] != settings[key]}:
         p.error(f"{args.json} holds results of {given}, but {settings} was asked for: give another --json.")
     returns: dict[str, dict[str, list[float]]] = document["returns"]

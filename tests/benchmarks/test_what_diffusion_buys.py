@@ -80,6 +80,20 @@ def test_rows_are_played_by_whom_they_name(run, tmp_path, monkeypatch, capsys):
             assert rollout(model, make, 2, 10_000, 20).returns.tolist() == returns[f"{row}/1"]["2"]
 
 
+def test_other_settings_of_the_planner_need_another_file(run, tmp_path, monkeypatch, capsys):
+    original, trained = script.train, []
+    monkeypatch.setattr(script, "train", lambda *args: trained.append(args[1]) or original(*args))
+    words = [str(run), "--updates", "3", "--delays", "2", "--episodes", "1", "--seeds", "1", "--rows", "one step"]
+    words += ["--json", str(tmp_path / "other.json")]
+    script.main(words)
+    with pytest.raises(SystemExit):
+        script.main([*words, "--planner-kwargs", "end_time_probability=1.0"])
+    assert "'planner_kwargs': {}" in capsys.readouterr().err
+    other = [*words[:-1], str(tmp_path / "one_step.json"), "--planner-kwargs", "horizon=3,decision_weight=1.0"]
+    assert script.main(other)["planner_kwargs"] == {"horizon": 3, "decision_weight": 1.0}
+    assert trained[1] == replace(trained[0], horizon=3, decision_weight=1.0)
+
+
 def test_of_a_run_that_has_not_ended_the_checkpoint_counts(run):
     model = script.open_run(run)
     assert model.num_timesteps == 90 and model.replay_buffer.size() == 90 and model.actor.mu.bias.item() != 1.0
