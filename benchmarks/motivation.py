@@ -17,6 +17,7 @@ return  of one actor without delay that acts on each belief, over seeded episode
 from __future__ import annotations
 
 import argparse
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -57,13 +58,16 @@ class OldObservation:
 
 
 class AllAtOnce:
-    """SAID's answers to a batch at once, in a fraction of the time; from those row by row they differ by rounding."""
+    """SAID's answers to a batch at once, in a fraction of the time.
+
+    From those row by row they differ by rounding at temperature 0, and above it by noise that is drawn.
+    """
 
     def __init__(self, said: SAID):
         self.said = said
 
     def predict(self, observation: Any, *_: Any, **__: Any) -> tuple[np.ndarray, Any]:
-        return self.said.predict(observation, deterministic=False)  # at temperature 0 nothing is drawn
+        return self.said.predict(observation, deterministic=False)
 
 
 def split(data: Dataset, held_out: float, seed: int) -> tuple[Dataset, Dataset]:
@@ -225,15 +229,20 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
 
 
 def dict_of(option: str, text: str) -> dict[str, Any]:
-    """Read ``name=number`` pairs, parted by commas.
+    """Read ``name=value`` pairs, parted by commas; a value is a number where it can be one.
 
     :raises ArgumentTypeError: for anything else
     """
-    try:
-        pairs = [pair.split("=") for pair in text.split(",")]
-        return {name: float(value) if "." in value else int(value) for name, value in pairs}
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"{option} takes NAME=NUMBER,..., such as depth=2, got {text}") from error
+    found = {}
+    for pair in text.split(","):
+        name, is_pair, value = pair.partition("=")
+        if not (name and is_pair and value):
+            raise argparse.ArgumentTypeError(f"{option} takes NAME=VALUE,..., such as depth=2, got {text}")
+        for kind in (int, float, str):
+            with suppress(ValueError):
+                found[name] = kind(value)
+                break
+    return found
 
 
 if __name__ == "__main__":

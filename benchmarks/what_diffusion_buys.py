@@ -15,19 +15,22 @@ SAID                 SAID as its preset decides: in five steps at temperature 0
 weighed              SAID whose critics weigh the candidates of two steps at temperature 1
 chosen by Q          the best of these candidates by the mean min Q(s, a) of the steps planned after the decision
 chosen by V          the same by V(s), learned on the replay by implicit Q-learning with two steps for each update
+together             the mean of the answers that the seeds' planners give as "SAID"
 paper                SAID with the paper's settings (Tables 3 and 4), but for its averaging, which is warmed up so that
                      few updates count, and its precision, which is the preset's; seconds a decision on a CPU
 paper, 2 steps       the same planner in two denoising steps, which the paper has in its appendix, a tenth of the time
 paper, temperature 0 the same planner in five steps and one candidate, as SAID decides
 
 The planner's seed decides its initial weights, its batches and those of the networks. Every row of a seed learns from
-the same batches, but the paper's, which has windows and batches of its own. A call plays what --json lacks, so the same
-command goes on after a stop; the planner of a seed is trained anew if one of its rows is missing.
+the same batches, but the paper's, which has windows and batches of its own. Planners answer all episodes at once, in a
+fraction of the time. A call plays what --json lacks, so the same command goes on after a stop; the planner of a seed is
+trained anew if one of its rows is missing, and those of all seeds if "together" is.
 """
 
 from __future__ import annotations
 
 import argparse
+import copy
 import json
 from collections.abc import Iterator
 from dataclasses import replace
@@ -39,7 +42,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from measure import progress
-from motivation import dict_of
+from motivation import AllAtOnce, dict_of
 from tqdm import tqdm
 
 from sb3_said import SAID, DelayedObservationWrapper, PlannerConfig
@@ -49,6 +52,7 @@ from sb3_said.files.archive import load_tree
 from sb3_said.files.atomic import write_json
 from sb3_said.files.checkpoint import CHECKPOINT_NAME
 from sb3_said.offline.belief import BeliefOnly, PlannerBelief, as_in_a_window
+from sb3_said.planner import InpaintingPlanner
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.said.trial import WAYS
 from sb3_said.zoo.runs import load_run
@@ -68,7 +72,8 @@ PAPER = {
     "paper, 2 steps": {"sampling_steps": 2},
     "paper, temperature 0": WAYS["default"],
 }
-ROWS = (*EXPERT, *LEARNED, *PAPER)
+ROWS = (*EXPERT, *LEARNED, "together", *PAPER)
+ALONE = (*EXPERT, "together")  # rows that have no planner's seed
 
 
 class Regression:
@@ -99,6 +104,24 @@ class Regression:
         delay = tensors["delay"][:, 0].long()
         action = self.ask(tensors["observation"], tensors["action_history"], delay)[1]
         return self.model.policy.unscale_action(action.numpy()), state
+
+
+class Together:
+    """Answers with the mean of what several planners answer.
+
+    :param model: whose planners they are
+    :param planners: that take its place in turn
+    """
+
+    def __init__(self, model: SAID, planners: list[InpaintingPlanner]):
+        self.model, self.planners = model, planners
+
+    def predict(self, observation: Any, state: Any = None, **_: Any) -> tuple[np.ndarray, Any]:
+        answers = []
+        for planner in self.planners:
+            self.model.policy.planner = planner
+            answers.append(AllAtOnce(self.model).predict(observation)[0])
+        return np.mean(answers, axis=0), state
 
 
 def open_run(folder: Path) -> SAID:
@@ -175,9 +198,11 @@ def players(model: SAID, rows: list[str], args: argparse.Namespace) -> Iterator[
         with policy.answering("expert"):
             yield "expert, average", None, model
     preset = replace(policy.planner.config, **WAYS["default"], **args.planner_kwargs)  # whatever the run's trial chose
+    together: list[InpaintingPlanner] = []
     for seed in args.seeds:
-        if any(f"{row}/{seed}" in rows for row in LEARNED):
+        if "together/None" in rows or any(f"{row}/{seed}" in rows for row in LEARNED):
             trainer = train(model, preset, args.updates, seed)
+            together.append(copy.deepcopy(policy.planner))
             regression = Regression(trainer, model)
             with policy.answering("expert"):
                 yield "cloning", seed, regression
@@ -188,7 +213,7 @@ def players(model: SAID, rows: list[str], args: argparse.Namespace) -> Iterator[
                     learn_values(model, args.updates)
                 policy.planner.config = replace(preset, **how)
                 with policy.answering("planner"):
-                    yield row, seed, model
+                    yield row, seed, AllAtOnce(model)
             policy.set_value("critics")
         if any(f"{row}/{seed}" in rows for row in PAPER):
             train(
@@ -201,7 +226,10 @@ def players(model: SAID, rows: list[str], args: argparse.Namespace) -> Iterator[
             for row, how in PAPER.items():
                 policy.planner.config = replace(papers, **how)
                 with policy.answering("planner"):
-                    yield row, seed, model
+                    yield row, seed, AllAtOnce(model)
+    if "together/None" in rows:
+        with policy.answering("planner"):
+            yield "together", None, Together(model, together)
 
 
 def main(argv: list[str] | None = None) -> dict[str, Any]:
@@ -233,13 +261,14 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
         p.error(f"{args.json} holds results of {given}, but {settings} was asked for: give another --json.")
     returns: dict[str, dict[str, list[float]]] = document["returns"]
 
-    keys = [f"{row}/{seed}" for row in args.rows for seed in ([None] if row in EXPERT else args.seeds)]
+    keys = [f"{row}/{seed}" for row in args.rows for seed in ([None] if row in ALONE else args.seeds)]
     missing = [key for key in keys if any(str(d) not in returns.get(key, {}) for d in args.delays)]
     for row, seed, player in players(model, missing, args):
         key = f"{row}/{seed}"
         for delay in args.delays if key in missing else ():
             if str(delay) not in returns.setdefault(key, {}):
                 progress(f"{key} plays {args.episodes} episodes at delay {delay}")
+                th.manual_seed(seed or 0)  # of the noise of candidates
                 played = rollout(player, partial(make_env, model, delay), args.episodes, args.eval_seed, args.n_envs)
                 returns[key][str(delay)] = played.returns.tolist()
                 write_json(args.json, document)
@@ -252,7 +281,7 @@ def show(returns: dict[str, dict[str, list[float]]], args: argparse.Namespace) -
     print("| return at delay | " + " | ".join(map(str, args.delays)) + " |")
     print("|---" * (len(args.delays) + 1) + "|")
     for row in args.rows:
-        seeds = [None] if row in EXPERT else args.seeds
+        seeds = [None] if row in ALONE else args.seeds
         texts = []
         for delay in args.delays:
             values = np.array([returns[f"{row}/{seed}"][str(delay)] for seed in seeds])  # (n_seeds, n_episodes)

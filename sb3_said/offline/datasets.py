@@ -166,16 +166,18 @@ def _read(source: Any, state_space: spaces.Box, action_space: spaces.Box, env_id
     if isinstance(source, Dataset):
         return source
     if isinstance(source, ReplayBuffer):
-        trajectories, name = _of_buffer(source), type(source).__name__
+        parts, name = _of_buffer(source), type(source).__name__
+        named = {f"environment {i} of {name}": columns for i, columns in enumerate(parts)}
     elif is_file(source):
         name = os.fspath(source)
-        trajectories = [_of_columns(name, _read_columns(Path(source)))]
+        named = {name: _of_columns(name, _read_columns(Path(source)))}
     else:
-        trajectories, name = _of_minari(source, env_id, bar)
-    trajectories = [columns for columns in trajectories if len(columns["rewards"])]
-    if not trajectories:
+        parts, name = _of_minari(source, env_id, bar)
+        named = {f"episode {i} of {name}": columns for i, columns in enumerate(parts)}
+    read = [_checked(where, part, state_space, action_space) for where, part in named.items() if len(part["rewards"])]
+    if not read:
         raise ValueError(f"{name} has no step whose next state is known.")
-    return _joined([_checked(name, columns, state_space, action_space) for columns in trajectories])
+    return _joined(read)
 
 
 def _joined(parts: Sequence[Dataset]) -> Dataset:

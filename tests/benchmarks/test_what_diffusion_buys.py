@@ -1,5 +1,6 @@
 """benchmarks/what_diffusion_buys.py: every row is played by whom it names, and nothing is played twice."""
 
+import copy
 import json
 import sys
 from dataclasses import replace
@@ -53,7 +54,7 @@ def test_rows_are_played_by_whom_they_name(run, tmp_path, monkeypatch, capsys):
     out = capsys.readouterr().out
     returns = document["returns"]
     assert trained == [1, 1, 2, 2] and json.loads(file.read_text()) == document
-    assert set(returns) == {"expert, last/None", "expert, average/None"} | {
+    assert set(returns) == {"expert, last/None", "expert, average/None", "together/None"} | {
         f"{row}/{seed}" for row in (*script.LEARNED, *script.PAPER) for seed in (1, 2)
     }
     assert all(len(returns[key][delay]) == 2 for key in returns for delay in ("0", "2"))
@@ -77,7 +78,27 @@ def test_rows_are_played_by_whom_they_name(run, tmp_path, monkeypatch, capsys):
             script.learn_values(model, 3)
         model.set_planner(**script.SETTINGS[row])
         with model.policy.answering("planner"):
-            assert rollout(model, make, 2, 10_000, 20).returns.tolist() == returns[f"{row}/1"]["2"]
+            th.manual_seed(1)
+            played = rollout(script.AllAtOnce(model), make, 2, 10_000, 20)
+            assert played.returns.tolist() == returns[f"{row}/1"]["2"]
+
+
+def test_together_planners_answer_their_mean(run):
+    model = script.open_run(run)
+    planners = []
+    for seed in (1, 2):
+        script.train(model, model.policy.planner.config, 2, seed)
+        planners.append(copy.deepcopy(model.policy.planner))
+    observation = {"observation": np.ones((3, 4), np.float32), "action_history": np.zeros((3, 2, 1), np.float32)}
+    observation["delay"] = np.array([[0.0], [1.0], [2.0]], np.float32)
+    with model.policy.answering("planner"):
+        answer, _ = script.Together(model, planners).predict(observation)
+        alone = []
+        for planner in planners:
+            model.policy.planner = planner
+            alone.append(model.predict(observation)[0])
+    np.testing.assert_allclose(answer, (alone[0] + alone[1]) / 2, rtol=1e-6)
+    assert np.abs(alone[0] - alone[1]).max() > 1e-4
 
 
 def test_other_settings_of_the_planner_need_another_file(run, tmp_path, monkeypatch, capsys):
@@ -89,9 +110,12 @@ def test_other_settings_of_the_planner_need_another_file(run, tmp_path, monkeypa
     with pytest.raises(SystemExit):
         script.main([*words, "--planner-kwargs", "end_time_probability=1.0"])
     assert "'planner_kwargs': {}" in capsys.readouterr().err
-    other = [*words[:-1], str(tmp_path / "one_step.json"), "--planner-kwargs", "horizon=3,decision_weight=1.0"]
-    assert script.main(other)["planner_kwargs"] == {"horizon": 3, "decision_weight": 1.0}
-    assert trained[1] == replace(trained[0], horizon=3, decision_weight=1.0)
+    other = [*words[:-1], str(tmp_path / "one_step.json"), "--planner-kwargs", "horizon=3,decision_weight=1.0,lr_schedule=constant"]
+    assert script.main(other)["planner_kwargs"] == {"horizon": 3, "decision_weight": 1.0, "lr_schedule": "constant"}
+    assert trained[1] == replace(trained[0], horizon=3, decision_weight=1.0, lr_schedule="constant")
+    with pytest.raises(SystemExit):
+        script.main([*other[:-1], "horizon"])
+    assert "--planner-kwargs takes NAME=VALUE" in capsys.readouterr().err
 
 
 def test_of_a_run_that_has_not_ended_the_checkpoint_counts(run):

@@ -189,6 +189,12 @@ def test_a_minari_dataset_is_read_by_its_id(log, tmp_path, monkeypatch):
         "test/log-v0", episodes, observation_space=STATES, action_space=ACTIONS, env="Pendulum-v1"
     )
     same(load("test/log-v0"), load(write(tmp_path / "log.npz", log)))
+    episodes[2].rewards[3] = np.nan
+    minari.create_dataset_from_buffers(
+        "test/broken-v0", episodes, observation_space=STATES, action_space=ACTIONS, env="Pendulum-v1"
+    )
+    with pytest.raises(ValueError, match="Row 3 of episode 2 of test/broken-v0: rewards must be finite"):
+        load("test/broken-v0")
     with pytest.raises(ValueError, match="test/log-v0 is of Pendulum-v1, and the task is Hopper-v5"):
         load("test/log-v0", env_id="Hopper-v5")
     with pytest.raises(ValueError, match=r"no dataset 'test/nothing-v0'.*test/log-v0"):
