@@ -110,7 +110,12 @@ def test_other_settings_of_the_planner_need_another_file(run, tmp_path, monkeypa
     with pytest.raises(SystemExit):
         script.main([*words, "--planner-kwargs", "end_time_probability=1.0"])
     assert "'planner_kwargs': {}" in capsys.readouterr().err
-    other = [*words[:-1], str(tmp_path / "one_step.json"), "--planner-kwargs", "horizon=3,decision_weight=1.0,lr_schedule=constant"]
+    other = [
+        *words[:-1],
+        str(tmp_path / "one_step.json"),
+        "--planner-kwargs",
+        "horizon=3,decision_weight=1.0,lr_schedule=constant",
+    ]
     assert script.main(other)["planner_kwargs"] == {"horizon": 3, "decision_weight": 1.0, "lr_schedule": "constant"}
     assert trained[1] == replace(trained[0], horizon=3, decision_weight=1.0, lr_schedule="constant")
     with pytest.raises(SystemExit):
