@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.graphs import RecordedFunction
 from sb3_said.planner.inpainting import draw_delays
+from sb3_said.planner.memory import keep_freed_memory
 from sb3_said.planner.planner import InpaintingPlanner
 from sb3_said.planner.values import scaled_values, window_weight
 from sb3_said.planner.yardstick import RegressionYardstick
@@ -102,6 +103,8 @@ class PlannerTrainer:
         self.n_updates = 0
         self.device = planner.device
         on_gpu = self.device.type == "cuda"
+        if not on_gpu:
+            keep_freed_memory()
         self.generator = th.Generator(self.device if on_gpu else "cpu").manual_seed(seed)
         self._settings = {
             **planner.config.weight_settings(),
