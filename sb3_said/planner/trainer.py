@@ -173,7 +173,8 @@ class PlannerTrainer:
         config = self.config
         for optimizer in self._optimizers.values():
             optimizer.zero_grad()
-        windows = self.source.sample(config.batch_size, self.average.window_length, self.generator)
+        drawn = config.batch_size, self.average.window_length, self.generator, config.early_probability
+        windows = self.source.sample(*drawn)
         mask = config.mask, config.mask_end_probability
         delay = draw_delays(config.batch_size, self.average.max_delay, *mask, self.generator).to(self.device)  # (B,)
         weight = window_weight(windows.values, config.weight_factor)  # (B,)

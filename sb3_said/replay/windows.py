@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import torch as th
@@ -63,16 +64,35 @@ class WindowSource:
     def act_dim(self) -> int:
         return self.actions.shape[-1]
 
-    def sample(self, batch_size: int, length: int, generator: th.Generator | None = None) -> Windows:
-        """Draw windows whose starts are uniform over all stored steps.
+    def sample(
+        self, batch_size: int, length: int, generator: th.Generator | None = None, early_probability: float = 0.0
+    ) -> Windows:
+        """Draw windows whose starts are uniform over all stored steps, but for a part that is drawn early in episodes.
 
         :param batch_size: B
         :param length: L, steps of a window
         :param generator: torch's global one of the CPU by default
+        :param early_probability: of a start whose episode is uniform over all episodes, and the logarithm of whose step
+            is uniform: as many in steps 1 to 10 of an episode as in 10 to 100
         """
         device = "cpu" if generator is None else generator.device
-        starts = th.randint(len(self), (batch_size,), generator=generator, device=device)
-        return self.gather(starts.to(self.rows.device), length)
+        starts = th.randint(len(self), (batch_size,), generator=generator, device=device).to(self.rows.device)
+        if early_probability > 0:
+            order, firsts, sizes = self._by_episode
+            draw = partial(th.rand, batch_size, generator=generator, device=device)
+            is_early, place, step = (draw().to(starts.device) for _ in range(3))
+            episode = (place * len(sizes)).long().clamp(max=len(sizes) - 1)  # (B,)
+            step = ((sizes[episode] + 1) ** step - 1).long().clamp(max=sizes[episode] - 1)
+            starts = th.where(is_early < early_probability, order[firsts[episode] + step], starts)
+        return self.gather(starts, length)
+
+    @cached_property
+    def _by_episode(self) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """All starts by episode and step, (n_starts,), and each episode's first place there and number of starts."""
+        by_step = self.remaining.argsort(descending=True, stable=True)
+        order = by_step[self.episodes[by_step].argsort(stable=True)]
+        sizes = th.unique(self.episodes, return_counts=True)[1]
+        return order, sizes.cumsum(0) - sizes, sizes
 
     def gather(self, starts: th.Tensor, length: int) -> Windows:
         """Return the windows at given starts.

@@ -107,6 +107,7 @@ OTHER_SETTINGS = {
     "schedule": "linear",
     "time_sampling": "uniform",
     "end_time_probability": 0.9,
+    "early_probability": 0.9,
     "mask": "fixed",
     "mask_end_probability": 0.0,
     "extra_state_probability": 0.9,
@@ -226,10 +227,22 @@ def naive_network(network, x, known, t):
     return network.out(layer_norm(tokens) * (1 + parts[-1]) + parts[-2])
 
 
+def naive_starts(source, config, generator):
+    """Draw where the windows start, part of them early in an episode."""
+    starts = th.randint(len(source), (config.batch_size,), generator=generator)
+    is_early, place, step = (th.rand(config.batch_size, generator=generator) for _ in range(3))
+    numbers = source.episodes.unique()
+    for i in th.nonzero(is_early < config.early_probability)[:, 0].tolist():
+        episode = th.nonzero(source.episodes == numbers[int(place[i] * len(numbers))])[:, 0].tolist()
+        episode.sort(key=lambda start: -int(source.remaining[start]))
+        starts[i] = episode[int((len(episode) + 1) ** step[i] - 1)]
+    return starts
+
+
 def naive_loss(planner, source, config, generator):
     """Draw as a step does, and add up the error window by window in float64."""
     n, length = config.batch_size, planner.window_length
-    starts = th.randint(len(source), (n,), generator=generator)
+    starts = naive_starts(source, config, generator)
     delays = draw_delays(n, planner.max_delay, config.mask, config.mask_end_probability, generator)
     noise = th.randn(n, length, STATE_DIM + ACTION_DIM, generator=generator)
     times = draw_times(n, config.schedule, config.time_sampling, config.end_time_probability, generator)

@@ -153,6 +153,26 @@ def test_sample_is_uniform_over_steps_and_repeats_with_a_generator():
     assert not th.equal(windows.states, source.sample(20_000, 4, th.Generator().manual_seed(1)).states)
 
 
+@pytest.mark.parametrize("probability", [0.25, 1.0])
+def test_a_part_of_the_windows_starts_early_in_episodes(probability):
+    lengths = [1, 3, 40]
+    source = make_source(lengths)
+    source = source._select(th.randperm(len(source), generator=th.Generator().manual_seed(0)))  # stored in any order
+    n = 200_000
+    windows = source.sample(n, 4, th.Generator().manual_seed(0), probability)
+    counted = np.zeros((len(lengths), max(lengths)))
+    np.add.at(counted, tuple(windows.states[:, 0].long().T.numpy()), 1 / n)
+    expected = np.zeros_like(counted)
+    for episode, length in enumerate(lengths):
+        steps = np.arange(length)
+        early = np.log((steps + 2) / (steps + 1)) / np.log(length + 1) / len(lengths)
+        expected[episode, :length] = probability * early + (1 - probability) / sum(lengths)
+    assert expected.sum() == pytest.approx(1)
+    np.testing.assert_allclose(counted, expected, atol=5 * np.sqrt(expected.max() / n))
+    again = source.sample(n, 4, th.Generator().manual_seed(0), probability)
+    assert all(th.equal(a, b) for a, b in zip(windows, again, strict=True))
+
+
 def test_a_short_episode_repeats_its_last_row():
     windows = make_source([2, 9]).gather(th.tensor([0, 1, 2]), 4)
     assert windows.states[..., 0].tolist() == [[0, 0, 0, 0], [0, 0, 0, 0], [1, 1, 1, 1]]
