@@ -27,7 +27,8 @@ class Distillation:
     """
 
     n_labels: int = 50_000
-    """answers of the planner to observations from the replay, at ages drawn from all that it plans at"""
+    """answers of the planner to observations from the replay, drawn as its windows are, at ages drawn from all that it
+    plans at"""
     own_steps: int = 40_000
     """and to those that the student visits itself (DAgger, Ross et al. 2011), over all rounds"""
     rounds: int = 10
