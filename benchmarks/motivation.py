@@ -11,7 +11,8 @@ error   root mean squared error of s_t on held-out episodes, in standard deviati
         all beliefs
 return  of one actor without delay that acts on each belief, over seeded episodes: behaviour cloning of the same
         episodes at delay 0, or --actor. Beside it "old observation", on which it acts as if nothing was delayed,
-        "SAID", whose planner decides itself, and "cloning": BC on the augmented state
+        "SAID", whose planner decides itself, "one step", the same with one step of denoising, and "cloning": BC on
+        the augmented state
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ from sb3_said.offline.belief import (
 
 N_WINDOWS = 5_000  # held out, at most
 PLAIN: dict[str, type[LearnedBelief]] = {"rolled out": RolledOutModel, "regressed": RegressedPresent}
-PLAYERS = ["inpainted", *PLAIN, "old observation", "SAID", "cloning"]
+PLAYERS = ["inpainted", *PLAIN, "old observation", "SAID", "one step", "cloning"]
 
 
 class OldObservation:
@@ -58,15 +59,17 @@ class OldObservation:
 
 
 class AllAtOnce:
-    """SAID's answers to a batch at once, in a fraction of the time.
+    """SAID's answers to a batch at once, in a fraction of the time, with other settings of sampling if any are given.
 
     From those row by row they differ by rounding at temperature 0, and above it by noise that is drawn.
     """
 
-    def __init__(self, said: SAID):
+    def __init__(self, said: SAID, **settings: Any):
         self.said = said
+        self.settings = settings
 
     def predict(self, observation: Any, *_: Any, **__: Any) -> tuple[np.ndarray, Any]:
+        self.said.set_planner(**self.settings)
         return self.said.predict(observation, deterministic=False)
 
 
@@ -212,7 +215,8 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     document["errors"] = errors(held, beliefs, args)
     show({k: [f"{x:.3f}" for x in row] for k, row in document["errors"].items()}, "error at delay", args.delays)
     players: dict[str, Any] = {name: BeliefOnly(belief, actor, args.device) for name, belief in beliefs.items()}
-    players["SAID"] = AllAtOnce(said) if said.policy.planner.config.temperature == 0 else said
+    players["SAID"] = AllAtOnce(said, sampling_steps=said.policy.planner.config.sampling_steps)
+    players["one step"] = AllAtOnce(said, sampling_steps=1)
     players["cloning"] = cloning
     table = returns({name: players[name] for name in args.players}, args)
     show({k: [str(s.mean_return) for s in row] for k, row in table.items()}, "return at delay", args.delays)

@@ -26,7 +26,13 @@ from sb3_said.evaluation import plots
 from sb3_said.offline import normalized_score
 
 DELAYS = (0, 4, 8, 16)
-NAMES = {"SAID": "SAID", "inpainted": "belief-only", "cloning": "BC", "rolled out": "belief-only, rolled-out model"}
+NAMES = {
+    "SAID": "SAID",
+    "one step": "SAID, one step",
+    "inpainted": "belief-only",
+    "cloning": "BC",
+    "rolled out": "belief-only, rolled-out model",
+}
 #: (set, task) -> rows of Table 2 at delays 0, 4, 8 and 16. DQL+SA has no number at delay 0 but that of their DQL.
 PAPER: dict[tuple[str, str], dict[str, tuple[float, ...]]] = {
     ("expert", "HalfCheetah-v5"): {"SAID": (106.2, 32.8, 4.5, 1.9), "DQL+SA": (95.9, 2.9, 2.1, 1.4)},

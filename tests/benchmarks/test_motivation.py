@@ -54,7 +54,7 @@ def test_it_measures_errors_and_returns_of_each_belief(log, tmp_path, capsys):
     written = json.loads((tmp_path / "m.json").read_text())
     assert written["errors"] == made["errors"] and written["planner"]["d_model"] == 32
     names = ["inpainted", "rolled out", "regressed", "old observation"]
-    assert list(written["errors"]) == names and list(written["returns"]) == [*names, "SAID", "cloning"]
+    assert list(written["errors"]) == names and list(written["returns"]) == [*names, "SAID", "one step", "cloning"]
     for name, (now, later) in written["errors"].items():
         assert later > 0 and (now < 1e-6 or name == "regressed")  # which is asked at delay 0, too
     at_0 = {name: tuple(row[0]["returns"]) for name, row in written["returns"].items()}
