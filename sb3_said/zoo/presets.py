@@ -19,8 +19,9 @@ CONFIGS = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).resolve().parent
 
 def config_file(algo: str, offline: bool = False) -> Path:
     """Return the YAML file of an algorithm; SAC, SA, DR and SADR share one, and SAID has another for logs."""
-    names = {"said": "said_offline.yml" if offline else "said.yml", "bc": "bc.yml", "dql": "dql.yml"}
-    return CONFIGS / names.get(algo, "delayed_sac.yml")
+    if algo in ("sac", "sa", "dr", "sadr"):
+        return CONFIGS / "delayed_sac.yml"
+    return CONFIGS / ("said_offline.yml" if algo == "said" and offline else f"{algo}.yml")
 
 
 def dataset_kind(dataset: Sequence[str]) -> str:
@@ -39,8 +40,8 @@ def preset_overrides(
 ) -> dict[str, Any]:
     """Return what a preset changes for a task: its own entry of ``presets:`` in the file, or the preset's default.
 
-    ``cpu`` changes nothing of the file's block for the task: the constructors' defaults, and a
-    ``planner_terminal_penalty`` for tasks that end by falling. Two keys are for planners: ``planner_kwargs: {base:
+    ``cpu`` changes nothing of the file's block for the task: the constructors' defaults, a
+    ``planner_terminal_penalty`` for tasks that end by falling, and a larger ``gamma`` on legs. Two keys are for planners: ``planner_kwargs: {base:
     paper, ...}`` starts from ``PlannerConfig.paper()``, and ``planner_by_delay`` holds settings to add, by the largest
     delay and under ``varies`` for delays that are not one number; ``planner_by_dataset`` has such for each kind of
     dataset.

@@ -50,13 +50,21 @@ def test_the_default_preset_and_the_constructor_make_the_same_agent(env_id: str,
     assert made is not None
     model, plain = made[0], SAID("MultiInputPolicy", DelayedObservationWrapper(gym.make(env_id), delay=2))
     assert isinstance(model, SAID) and model.policy.planner.config == plain.policy.planner.config
-    names = {"buffer_size", "learning_starts", "batch_size", "tau", "gamma", "train_freq", "gradient_steps", "ent_coef"}
+    names = {"buffer_size", "learning_starts", "batch_size", "tau", "train_freq", "gradient_steps", "ent_coef"}
     names |= {"planner_gradient_steps", "planner_train_freq", "planner_newest_fraction", "relabelled_ages"}
     assert {n: getattr(model, n) for n in names} == {n: getattr(plain, n) for n in names}
     assert model.lr_schedule(1.0) == plain.lr_schedule(1.0)
     # The numbers that the results stand on.
     assert (model.learning_starts, model.planner_gradient_steps, model.planner_newest_fraction) == (10_000, 25_000, 0.2)
     assert (model.policy.planner.config.d_model, model.policy.planner.config.scored_states) == (128, "decision")
+
+
+@pytest.mark.parametrize("algo", ["said", "stable", "sadr"])
+def test_the_expert_looks_further_ahead_on_legs_that_fall(algo: str, tmp_path: Path) -> None:
+    for env_id in (*TASKS, "Humanoid-v5", "InvertedPendulum-v5"):
+        falls = algo != "sadr" and env_id not in ("HalfCheetah-v5", "InvertedPendulum-v5")
+        assert merged_settings(algo, "cpu", env_id, 2, tmp_path)["gamma"] == (0.995 if falls else 0.99)
+    assert merged_settings("said", "paper", "Hopper-v5", 2, tmp_path)["gamma"] == 0.99
 
 
 @pytest.mark.parametrize("preset", PRESETS)
