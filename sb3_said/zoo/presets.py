@@ -41,10 +41,10 @@ def preset_overrides(
     """Return what a preset changes for a task: its own entry of ``presets:`` in the file, or the preset's default.
 
     ``cpu`` changes nothing of the file's block for the task: the constructors' defaults, a
-    ``planner_terminal_penalty`` for tasks that end by falling, and a larger ``gamma`` on legs. Two keys are for planners: ``planner_kwargs: {base:
-    paper, ...}`` starts from ``PlannerConfig.paper()``, and ``planner_by_delay`` holds settings to add, by the largest
-    delay and under ``varies`` for delays that are not one number; ``planner_by_dataset`` has such for each kind of
-    dataset.
+    ``planner_terminal_penalty`` for tasks that end by falling, and a larger ``gamma`` on legs. Two keys are for
+    planners: ``planner_kwargs: {base: paper, ...}`` starts from ``PlannerConfig.paper()``, and ``planner_by_delay``
+    holds settings to add, by the largest delay and under ``varies`` for delays that are not one number;
+    ``planner_by_dataset`` has such for each kind of dataset.
 
     :param max_delay: length of the action history, the largest of ``delay`` by default; a longer one varies, too
     :param dataset: logs to learn from, whose names tell their kind
