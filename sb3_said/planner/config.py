@@ -32,6 +32,9 @@ class PlannerConfig:
     d_model: int = 128  # as accurate as the paper's 256 in the same time on two cores; a multiple of 32
     horizon: int = 8  # paper; a window is max_delay + horizon steps, >= 2 so that a state follows the decision
     embed_known: bool = True  # measured: buys as much accuracy as doubling the depth
+    # Show the network what plain networks make of what is known: the states since by a model of one step, and a clone's
+    # action. A third off the decision's error on one log (results/offline.md); False (paper) until returns are measured
+    first_guess: bool = False
     # Diffusion
     prediction: str = "v"  # measured: safe with few steps; or "epsilon" (paper)
     schedule: str = "cosine"  # measured; or "linear" (DV)
@@ -143,6 +146,7 @@ class PlannerConfig:
             depth=depth,
             d_model=256,
             embed_known=False,
+            first_guess=False,
             prediction="epsilon",
             schedule="linear",
             time_sampling="uniform",

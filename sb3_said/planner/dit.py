@@ -83,6 +83,7 @@ class DiT1d(nn.Module):
     :param d_model: width, a multiple of 32
     :param embed_known: add an embedding of the whole known part to every token, beside showing it in its place
     :param extra_states: states at indices 1..D may be known too, and are embedded
+    :param first_guess: a guess of the window is shown beside what is known
     """
 
     frequencies: th.Tensor
@@ -99,6 +100,7 @@ class DiT1d(nn.Module):
         depth: int = 2,
         embed_known: bool = True,
         extra_states: bool = False,
+        first_guess: bool = False,
     ) -> None:
         super().__init__()
         self.d_model = d_model
@@ -109,6 +111,7 @@ class DiT1d(nn.Module):
         self.flag_embedding = nn.Linear(2, d_model, bias=False)
         n_known = obs_dim + max_delay * (act_dim + 1 + extra_states * (obs_dim + 1))
         self.known_embedding = _mlp(n_known, d_model) if embed_known else None
+        self.guess_embedding = nn.Linear(2 * obs_dim + act_dim, d_model) if first_guess else None
         self.time_embedding = _mlp(N_TIME_FEATURES, d_model)
         # One linear map for the modulations of all blocks (6 each) and of the output (2): one product instead of many
         self.modulation = nn.Linear(d_model, (6 * depth + 2) * d_model)
@@ -141,15 +144,19 @@ class DiT1d(nn.Module):
         rows = self.modulation(F.silu(embedded)).unflatten(-1, (-1, self.d_model))
         return rows + self.is_factor  # adaLN-zero predicts factors less 1. In float32, as the stream they act on
 
-    def context(self, window: th.Tensor, known: th.Tensor) -> th.Tensor:
-        """Return what is added to the tokens because of their place and of what is known: (B, L, d_model).
+    def context(self, window: th.Tensor, known: th.Tensor, guess: th.Tensor | None = None) -> th.Tensor:
+        """Return what is added to the tokens because of their place, of what is known and guessed: (B, L, d_model).
 
         :param window: (B, L, obs_dim + act_dim), normalised, L at most ``length``; only known entries are read
         :param known: (B, L, obs_dim + act_dim) bool known mask
+        :param guess: (B, L, 2 * obs_dim + act_dim), needed where the network was made to be shown one
         """
         # (B, L, 2): whether the state is known, and the action
         flags = th.stack((known[..., 0], known[..., self.obs_dim]), dim=-1).to(window.dtype)
         added = self.flag_embedding(flags) + self.positions[: window.shape[1]]
+        if self.guess_embedding is not None:
+            assert guess is not None
+            added = added + self.guess_embedding(guess)
         if self.known_embedding is None:
             return added
         # Zeros stand for the steps that a window of a smaller delay does not have

@@ -13,6 +13,7 @@ from sb3_said.planner import diffusion, inpainting
 from sb3_said.planner.checks import checked_delay, checked_extra_states, finite_tensor, float_tensor
 from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.dit import DiT1d
+from sb3_said.planner.first_guess import FirstGuess
 from sb3_said.planner.graphs import RecordedFunction
 from sb3_said.planner.normalizer import Normalizer
 from sb3_said.planner.precision import autocast
@@ -67,7 +68,9 @@ class InpaintingPlanner(nn.Module):
             config.depth,
             config.embed_known,
             config.extra_state_probability > 0,
+            config.first_guess,
         )
+        self.first_guess = FirstGuess(obs_dim, act_dim) if config.first_guess else None
         self.normalizer = Normalizer(
             obs_dim, act_dim, self.window_length, config.action_transform, config.relative_states
         )
@@ -149,13 +152,14 @@ class InpaintingPlanner(nn.Module):
             state_known = inpainting.draw_known_states(n, self.max_delay, config.extra_state_probability, generator)
             state_known = state_known.to(device)
         known = inpainting.known_mask(delay, length, self.obs_dim, self.act_dim, state_known) & valid[..., None]
+        guess = self._guess(states, actions, delay, known)
         noise = self._noise(clean.shape, generator)
         t = diffusion.draw_times(n, config.schedule, config.time_sampling, config.end_time_probability, generator)
         t = t.to(device)
         alpha, sigma = (factor[:, None, None] for factor in diffusion.alpha_sigma(t, config.schedule))
         x = th.where(known, clean, alpha * clean + sigma * noise)
         with autocast(config.precision, device):
-            output = self.network(x, self.network.context(clean, known), self.network.modulations(t), valid)
+            output = self.network(x, self.network.context(clean, known, guess), self.network.modulations(t), valid)
         target = diffusion.prediction_target(clean, noise, alpha, sigma, config.prediction)
         learned = valid[..., None] & ~known
         decision = th.arange(length, device=device) == delay[:, None]  # (B, L)
@@ -304,7 +308,8 @@ class InpaintingPlanner(nn.Module):
         valid = self._within(delay, length).repeat_interleave(x.shape[1], 0) if is_mixed else None  # (B * N, L)
         network = self.network
         modulations = network.modulations(times)  # (n_steps, 6 * depth + 2, d_model)
-        context = network.context(clean, known)
+        guess = self._guess(given[..., : self.obs_dim], given[..., self.obs_dim :], delay, known)
+        context = network.context(clean, known, guess)
         # Of the largest age, so that decisions at all ages have one number format
         size = x.shape[0] * x.shape[1] * self.window_length * self.config.d_model
         with autocast(self.config.precision, x.device, size):
@@ -326,6 +331,17 @@ class InpaintingPlanner(nn.Module):
             values = score(value_fn, self.config, states, actions, delay, shortest)
         action = choose(actions[rows, :, delay], values, self.config.choice_factor)
         return Plan(action, present, states, actions, values)
+
+    def _guess(self, states: th.Tensor, actions: th.Tensor, delay: th.Tensor, known: th.Tensor) -> th.Tensor | None:
+        """Return what the network is shown of the first guess: (B, L, 2 * obs_dim + act_dim), z-scored, or None.
+
+        States both as they are and as moves since the first, which differ by little.
+        """
+        if self.first_guess is None:
+            return None
+        z = self.normalizer.normalize_states(states)
+        guess = self.first_guess(z, actions, delay, known[..., 0], longest=z.shape[1] - self.config.horizon)
+        return th.cat([guess, guess[..., : self.obs_dim] - z[:, :1]], dim=-1)
 
     def _within(self, delay: th.Tensor, length: int) -> th.Tensor:
         """Tell which steps a window of each delay has, d + horizon of them: (B, L) bool."""

@@ -103,6 +103,7 @@ OTHER_SETTINGS = {
     "d_model": 64,
     "horizon": 4,
     "embed_known": False,
+    "first_guess": True,
     "prediction": "epsilon",
     "schedule": "linear",
     "time_sampling": "uniform",

@@ -1,0 +1,118 @@
+"""Where a planner begins: what plain networks make of what is known."""
+
+from __future__ import annotations
+
+import torch as th
+from torch import nn
+
+from sb3_said.planner.config import PlannerConfig
+from sb3_said.planner.normalizer import Normalizer
+from sb3_said.planner.values import window_weight
+from sb3_said.replay.windows import WindowSource
+
+MODEL_WIDTH, CLONE_WIDTH = 512, 256
+LEARNING_RATE = 1e-3
+BATCH_SIZE = 256
+FARTHEST = 10.0  # standard deviations: a model that is asked far from its data must not run away
+
+
+def plain_network(n_in: int, n_out: int, hidden: int) -> nn.Sequential:
+    """Return a network of two hidden layers."""
+    return nn.Sequential(
+        *(nn.Linear(n_in, hidden), nn.ReLU()), *(nn.Linear(hidden, hidden), nn.ReLU()), nn.Linear(hidden, n_out)
+    )
+
+
+class FirstGuess(nn.Module):
+    """A model of one step, rolled out over the actions since the observation, and a clone that answers where it ends.
+
+    A planner learns one mask of each window, at many times the price of a plain network's sample. So these two know
+    sooner how a task moves and which action its data has for a present; but the model's errors compound, and the clone
+    knows nothing of them. That is the planner's to mend: it is shown the guess, and not bound to it.
+
+    States are z-scored, actions in [-1, 1].
+    """
+
+    move_std: th.Tensor
+
+    def __init__(self, obs_dim: int, act_dim: int) -> None:
+        super().__init__()
+        self.model = plain_network(obs_dim + act_dim, obs_dim, MODEL_WIDTH)
+        self.clone = plain_network(obs_dim, act_dim, CLONE_WIDTH)
+        self.register_buffer("move_std", th.ones(obs_dim))
+
+    def step(self, state: th.Tensor, action: th.Tensor) -> th.Tensor:
+        """Return the states that follow: (..., obs_dim).
+
+        :param state: (..., obs_dim)
+        :param action: (..., act_dim)
+        """
+        return state + self.move_std * self.model(th.cat([state, action], dim=-1))
+
+    @th.no_grad()
+    def forward(
+        self, states: th.Tensor, actions: th.Tensor, delay: th.Tensor, known: th.Tensor, longest: int
+    ) -> th.Tensor:
+        """Guess windows: the states up to the present, which stays, and from there on the clone's action.
+
+        :param states: (B, L, obs_dim), of which those are read that are known
+        :param actions: (B, L, act_dim), of which those before the decision are read
+        :param delay: (B,) int64 d
+        :param known: (B, L) bool, the states that are known, the first always
+        :param longest: an upper bound of the delays, below L
+        :return: (B, L, obs_dim + act_dim), 0 where an action is known
+        """
+        length, state = states.shape[1], states[:, 0]
+        guessed = [state]
+        for k in range(longest):
+            follows = self.step(state, actions[:, k]).clamp(-FARTHEST, FARTHEST)
+            follows = th.where(known[:, k + 1, None], states[:, k + 1], follows)
+            state = th.where((k < delay)[:, None], follows, state)
+            guessed.append(state)
+        guessed += [state] * (length - len(guessed))
+        is_decided = th.arange(length, device=delay.device) >= delay[:, None]  # (B, L)
+        action = self.clone(state).clamp(-1.0, 1.0)[:, None]  # (B, 1, act_dim)
+        return th.cat([th.stack(guessed, dim=1), th.where(is_decided[..., None], action, 0.0)], dim=-1)
+
+    def loss(self, states: th.Tensor, actions: th.Tensor, follows: th.Tensor, weight: th.Tensor) -> th.Tensor:
+        """Return the model's mean squared error, in moves of one step, plus the clone's, in action units.
+
+        :param states: (B, 2, obs_dim), one after the other
+        :param actions: (B, act_dim), between them
+        :param follows: (B,) bool, whether the second state is of the same episode
+        :param weight: (B,) factor of the clone's errors, as of the windows in the planner's loss
+        """
+        now, then = states.unbind(1)
+        of_model = (((self.step(now, actions) - then) / self.move_std) ** 2).mean(-1)  # (B,)
+        of_clone = ((self.clone(now) - actions) ** 2).mean(-1)
+        return (of_model * follows).sum() / follows.sum().clamp(min=1) + (of_clone * weight).mean()
+
+
+def fit_first_guess(
+    guess: FirstGuess,
+    source: WindowSource,
+    normalizer: Normalizer,
+    config: PlannerConfig,
+    n_updates: int,
+    generator: th.Generator,
+) -> None:
+    """Train the plain networks with Adam, whose rate falls to 0 by a cosine.
+
+    :param guess: to train, on the device of the source
+    :param source: windows whose values are those that weigh them
+    :param normalizer: fitted to the source
+    :param config: of the planner: how windows are drawn and weighed
+    :param generator: of the batches
+    """
+    guess.move_std.copy_(normalizer.move_std[0])
+    optimizer = th.optim.Adam(guess.parameters(), LEARNING_RATE, fused=True)
+    scheduler = th.optim.lr_scheduler.CosineAnnealingLR(optimizer, n_updates)
+    for _ in range(n_updates):
+        windows = source.sample(BATCH_SIZE, 2, generator, config.early_probability)
+        states = normalizer.normalize_states(windows.states)
+        weight = window_weight(windows.values, config.weight_factor)
+        loss = guess.loss(states, windows.actions[:, 0], windows.valid[:, 1], weight)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        scheduler.step()

@@ -1,0 +1,126 @@
+"""The first guess: against a naive loop and a system in closed form, and what it must not see."""
+
+from __future__ import annotations
+
+import pytest
+import torch as th
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from linear_system import ACTION_DIM, BEHAVIOUR_GAIN, STATE_DIM, make_source, present
+
+from sb3_said.planner import InpaintingPlanner, PlannerConfig
+from sb3_said.planner.first_guess import FirstGuess, fit_first_guess
+from sb3_said.planner.normalizer import Normalizer
+from sb3_said.planner.trainer import PlannerTrainer
+
+D, HORIZON = 4, 3
+L = D + HORIZON
+
+
+def make_guess() -> FirstGuess:
+    with th.random.fork_rng(devices=[]):
+        th.manual_seed(0)
+        return FirstGuess(STATE_DIM, ACTION_DIM)
+
+
+def make_windows(n: int, seed: int) -> tuple[th.Tensor, th.Tensor, th.Tensor, th.Tensor]:
+    generator = th.Generator().manual_seed(seed)
+    states = th.randn(n, L, STATE_DIM, generator=generator)
+    actions = 2 * th.rand(n, L, ACTION_DIM, generator=generator) - 1
+    delay = th.randint(D + 1, (n,), generator=generator)
+    known = (th.rand(n, L, generator=generator) < 0.3) & (th.arange(L) <= delay[:, None])
+    known[:, 0] = True
+    return states, actions, delay, known
+
+
+@th.no_grad()
+def test_it_is_a_naive_loop_over_each_window():
+    guess = make_guess()
+    states, actions, delay, known = make_windows(20, seed=1)
+    made = guess(states, actions, delay, known, longest=D)
+    for i, d in enumerate(delay.tolist()):
+        expected, state = [], states[i, 0]
+        for k in range(L):
+            if 0 < k <= d:
+                state = states[i, k] if known[i, k] else guess.step(state, actions[i, k - 1]).clamp(-10, 10)
+            expected.append(state)
+        th.testing.assert_close(made[i, :, :STATE_DIM], th.stack(expected))
+        action = guess.clone(expected[-1]).clamp(-1, 1)
+        th.testing.assert_close(made[i, d:, STATE_DIM:], action.expand(L - d, -1))
+        assert not made[i, :d, STATE_DIM:].any()
+
+
+@given(seed=st.integers(0, 2**31))
+@settings(max_examples=30, deadline=None)
+def test_it_sees_nothing_that_is_hidden(seed: int):
+    guess = make_guess()
+    states, actions, delay, known = make_windows(5, seed)
+    hidden_action = th.arange(L) >= delay[:, None]
+    others = states + ~known[..., None] * 3.0, actions + hidden_action[..., None] * 1.0
+    assert th.equal(guess(states, actions, delay, known, D), guess(*others, delay, known, D))
+
+
+def test_it_learns_a_linear_system_and_its_behaviour():
+    source = make_source(process_noise=0.0)
+    normalizer = Normalizer(STATE_DIM, ACTION_DIM, L, relative_states=True)
+    normalizer.fit(source.start_states(), source.start_actions())
+    generator = th.Generator().manual_seed(0)
+    windows = source.sample(2_000, L, generator)
+    normalizer.fit_moves(windows)
+    guess = make_guess()
+    fit_first_guess(guess, source, normalizer, PlannerConfig(weight_factor=0.0), 2_000, generator)
+    reaches = windows.valid[:, D]
+    states, actions = windows.states[reaches], windows.actions[reaches]
+    n = len(states)
+    z, known = normalizer.normalize_states(states), th.arange(L).expand(n, -1) == 0
+    made = guess(z, actions, th.full((n,), D), known, D)
+    truth = normalizer.normalize_states(present(states[:, 0], actions[:, :D], th.full((n,), D)))
+    assert (made[:, D, :STATE_DIM] - truth).abs().mean() < 0.05
+    behaviour = -(states[:, D] @ BEHAVIOUR_GAIN.T).clamp(-1, 1)  # its noise has mean 0, but where it is clipped
+    assert (made[:, D, STATE_DIM:] - behaviour).abs().mean() < 0.1
+    assert (made[:, D, STATE_DIM:] - behaviour).abs().mean() < 0.3 * behaviour.abs().mean()
+
+
+def make_trainer(**changes) -> PlannerTrainer:
+    small = dict(depth=1, d_model=32, horizon=HORIZON, batch_size=16, warmup_steps=4, first_guess=True)
+    with th.random.fork_rng(devices=[]):
+        th.manual_seed(0)
+        planner = InpaintingPlanner(STATE_DIM, ACTION_DIM, D, PlannerConfig(**{**small, **changes}))
+    return PlannerTrainer(planner, make_source(40, 20), gradient_steps=12)
+
+
+def test_a_training_with_it_resumes_bit_for_bit():
+    whole, first, second = (make_trainer() for _ in range(3))
+    whole.train()
+    first.train(5)
+    second.load_state_dict(first.state_dict())
+    second.train()
+    for name, weight in second.planner.state_dict().items():
+        assert th.equal(weight, whole.planner.state_dict()[name]), name
+    with pytest.raises(ValueError, match="first_guess was True and is now False"):
+        make_trainer(first_guess=False).load_state_dict(first.state_dict())
+
+
+def test_it_is_made_once_and_then_stays():
+    trainer = make_trainer()
+    trainer.step()
+    made = {name: weight.clone() for name, weight in trainer.average.first_guess.state_dict().items()}
+    trainer.train()
+    for planner in (trainer.planner, trainer.online):
+        for name, weight in planner.first_guess.state_dict().items():
+            assert th.equal(weight, made[name]), name
+
+
+def test_decisions_of_mixed_ages_are_those_one_by_one():
+    trainer = make_trainer(precision="float32")
+    trainer.train()
+    planner = trainer.planner
+    generator = th.Generator().manual_seed(1)
+    observation = th.randn(D + 1, STATE_DIM, generator=generator)
+    history = 2 * th.rand(D + 1, D, ACTION_DIM, generator=generator) - 1
+    delay = th.arange(D + 1)
+    together = planner.plan(observation, history, delay, temperature=0.0)
+    for i in range(D + 1):
+        alone = planner.plan(observation[i : i + 1], history[i : i + 1], delay[i : i + 1], temperature=0.0)
+        th.testing.assert_close(alone.action[0], together.action[i], atol=1e-5, rtol=1e-5)
+        th.testing.assert_close(alone.present[0], together.present[i], atol=1e-5, rtol=1e-5)
