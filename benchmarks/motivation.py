@@ -18,6 +18,7 @@ return  of one actor without delay that acts on each belief, over seeded episode
 from __future__ import annotations
 
 import argparse
+import ast
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -233,7 +234,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
 
 
 def dict_of(option: str, text: str) -> dict[str, Any]:
-    """Read ``name=value`` pairs, parted by commas; a value is a number where it can be one.
+    """Read ``name=value`` pairs, parted by commas; a value is a number or a bool where it can be one.
 
     :raises ArgumentTypeError: for anything else
     """
@@ -242,10 +243,9 @@ def dict_of(option: str, text: str) -> dict[str, Any]:
         name, is_pair, value = pair.partition("=")
         if not (name and is_pair and value):
             raise argparse.ArgumentTypeError(f"{option} takes NAME=VALUE,..., such as depth=2, got {text}")
-        for kind in (int, float, str):
-            with suppress(ValueError):
-                found[name] = kind(value)
-                break
+        found[name] = value
+        with suppress(ValueError, SyntaxError):
+            found[name] = ast.literal_eval(value)
     return found
 
 

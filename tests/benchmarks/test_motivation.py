@@ -48,11 +48,13 @@ def test_it_measures_errors_and_returns_of_each_belief(log, tmp_path, capsys):
     write_dataset(log, tmp_path / "log.npz", gym.make(ENV))
     paths = ["--json", str(tmp_path / "m.json"), "--plot", str(tmp_path / "m.png"), "--folder", str(tmp_path)]
     tiny = (
-        "--gradient-steps 3 --episodes 2 --delays 0 9 --held-out 0.3 --planner-kwargs depth=1,d_model=32,batch_size=8"
+        "--gradient-steps 3 --episodes 2 --delays 0 9 --held-out 0.3"
+        " --planner-kwargs depth=1,d_model=32,batch_size=8,embed_known=False"
     )
     made = motivation.main(["--env", ENV, "--dataset", str(tmp_path / "log.npz"), *tiny.split(), *paths])
     written = json.loads((tmp_path / "m.json").read_text())
     assert written["errors"] == made["errors"] and written["planner"]["d_model"] == 32
+    assert written["planner"]["embed_known"] is False
     names = ["inpainted", "rolled out", "regressed", "old observation"]
     assert list(written["errors"]) == names and list(written["returns"]) == [*names, "SAID", "one step", "cloning"]
     for name, (now, later) in written["errors"].items():

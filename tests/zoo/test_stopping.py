@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from sb3_said.files.archive import load_tree
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.sac import StableSAC
 from sb3_said.zoo import manager, train
-from sb3_said.zoo.stopping import Stopping
+from sb3_said.zoo.stopping import SIGNALS, Stopping
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "train.py"
 COMMAND = f"--algo said --env {ENV} --delay 2 --seed 3 --num-threads 1 --eval-freq -1 --device cpu --verbose 0"
@@ -61,6 +61,16 @@ def signal_at(patch: pytest.MonkeyPatch, cls: type, method: str, call: int, numb
 def same(left: Path, right: Path) -> bool:
     one, other = (SAID.load(run / f"{ENV}.zip", device="cpu").policy.state_dict() for run in (left, right))
     return all((one[key] == other[key]).all() for key in one)
+
+
+@pytest.fixture(autouse=True)
+def listening() -> Iterator[None]:
+    """Signals as in a terminal, wherever the suite runs: a background job of a shell ignores Ctrl-C, nohup SIGHUP."""
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in SIGNALS}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture(scope="module")
