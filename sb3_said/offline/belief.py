@@ -12,6 +12,7 @@ from torch.nn import functional as F
 from tqdm.auto import tqdm
 
 from sb3_said.planner import InpaintingPlanner
+from sb3_said.planner.plain import OneStepModel
 from sb3_said.planner.yardstick import RegressionYardstick
 from sb3_said.replay.windows import Windows, WindowSource
 
@@ -90,14 +91,7 @@ class RolledOutModel(LearnedBelief):
 
     def __init__(self, obs_dim: int, act_dim: int, max_delay: int, hidden: int = 512):
         super().__init__(obs_dim, max_delay)
-        self.net = nn.Sequential(
-            *(nn.Linear(obs_dim + act_dim, hidden), nn.ReLU()),
-            *(nn.Linear(hidden, hidden), nn.ReLU()),
-            nn.Linear(hidden, obs_dim),
-        )
-        self.register_buffer("step_std", th.ones(obs_dim))
-
-    step_std: th.Tensor
+        self.model = OneStepModel(obs_dim, act_dim, hidden)
 
     def fit_scale(self, states: th.Tensor) -> None:
         """Take over how states and their moves are spread, so that small moves count as much as large ones.
@@ -106,29 +100,19 @@ class RolledOutModel(LearnedBelief):
         """
         super().fit_scale(states)
         moves = self._z(states).diff(dim=0).abs().median(0).values
-        self.step_std.copy_(th.where(moves > 1e-6, moves, 1.0))
-
-    def step(self, z: th.Tensor, action: th.Tensor) -> th.Tensor:
-        """Return the next z-scored states: (B, obs_dim).
-
-        :param z: (B, obs_dim), z-scored
-        :param action: (B, act_dim)
-        """
-        return z + self.step_std * self.net(th.cat([z, action], dim=1))
+        self.model.move_std.copy_(th.where(moves > 1e-6, moves, 1.0))
 
     def present(self, state: th.Tensor, action_history: th.Tensor, delay: th.Tensor) -> th.Tensor:
         """Take one step for each action sent since: (B, obs_dim)."""
         z = self._z(state)
         for k in range(self.max_delay):
             is_since = (self.max_delay - k <= delay)[:, None]  # a_{t-D+k} came after s_{t-d}
-            z = th.where(is_since, self.step(z, action_history[:, k]), z)
+            z = th.where(is_since, self.model(z, action_history[:, k]), z)
         return z * self.std + self.mean
 
     def loss(self, windows: Windows, generator: th.Generator) -> th.Tensor:
         """Return the error of one step, in units of moves; a window gives its first."""
-        z, follows = self._z(windows.states[:, :2]), windows.valid[:, 1]
-        error = (self.step(z[:, 0], windows.actions[:, 0]) - z[:, 1]) / self.step_std
-        return (error**2).mean(1)[follows].mean()
+        return self.model.loss(self._z(windows.states[:, :2]), windows.actions[:, 0], windows.valid[:, 1])
 
 
 def as_in_a_window(action_history: th.Tensor, delay: th.Tensor) -> th.Tensor:

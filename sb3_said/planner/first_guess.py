@@ -7,20 +7,14 @@ from torch import nn
 
 from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.normalizer import Normalizer
+from sb3_said.planner.plain import OneStepModel, plain_network
 from sb3_said.planner.values import window_weight
 from sb3_said.replay.windows import WindowSource
 
-MODEL_WIDTH, CLONE_WIDTH = 512, 256
+CLONE_WIDTH = 256
 LEARNING_RATE = 1e-3
 BATCH_SIZE = 256
 FARTHEST = 10.0  # standard deviations: a model that is asked far from its data must not run away
-
-
-def plain_network(n_in: int, n_out: int, hidden: int) -> nn.Sequential:
-    """Return a network of two hidden layers."""
-    return nn.Sequential(
-        *(nn.Linear(n_in, hidden), nn.ReLU()), *(nn.Linear(hidden, hidden), nn.ReLU()), nn.Linear(hidden, n_out)
-    )
 
 
 class FirstGuess(nn.Module):
@@ -33,21 +27,10 @@ class FirstGuess(nn.Module):
     States are z-scored, actions in [-1, 1].
     """
 
-    move_std: th.Tensor
-
     def __init__(self, obs_dim: int, act_dim: int) -> None:
         super().__init__()
-        self.model = plain_network(obs_dim + act_dim, obs_dim, MODEL_WIDTH)
+        self.model = OneStepModel(obs_dim, act_dim)
         self.clone = plain_network(obs_dim, act_dim, CLONE_WIDTH)
-        self.register_buffer("move_std", th.ones(obs_dim))
-
-    def step(self, state: th.Tensor, action: th.Tensor) -> th.Tensor:
-        """Return the states that follow: (..., obs_dim).
-
-        :param state: (..., obs_dim)
-        :param action: (..., act_dim)
-        """
-        return state + self.move_std * self.model(th.cat([state, action], dim=-1))
 
     @th.no_grad()
     def forward(
@@ -65,7 +48,7 @@ class FirstGuess(nn.Module):
         length, state = states.shape[1], states[:, 0]
         guessed = [state]
         for k in range(longest):
-            follows = self.step(state, actions[:, k]).clamp(-FARTHEST, FARTHEST)
+            follows = self.model(state, actions[:, k]).clamp(-FARTHEST, FARTHEST)
             follows = th.where(known[:, k + 1, None], states[:, k + 1], follows)
             state = th.where((k < delay)[:, None], follows, state)
             guessed.append(state)
@@ -75,17 +58,15 @@ class FirstGuess(nn.Module):
         return th.cat([th.stack(guessed, dim=1), th.where(is_decided[..., None], action, 0.0)], dim=-1)
 
     def loss(self, states: th.Tensor, actions: th.Tensor, follows: th.Tensor, weight: th.Tensor) -> th.Tensor:
-        """Return the model's mean squared error, in moves of one step, plus the clone's, in action units.
+        """Return the model's loss plus the clone's mean squared error, in action units.
 
-        :param states: (B, 2, obs_dim), one after the other
-        :param actions: (B, act_dim), between them
-        :param follows: (B,) bool, whether the second state is of the same episode
+        :param states: (B, 2, obs_dim); this and the next two as of the model's loss
+        :param actions: (B, act_dim)
+        :param follows: (B,) bool
         :param weight: (B,) factor of the clone's errors, as of the windows in the planner's loss
         """
-        now, then = states.unbind(1)
-        of_model = (((self.step(now, actions) - then) / self.move_std) ** 2).mean(-1)  # (B,)
-        of_clone = ((self.clone(now) - actions) ** 2).mean(-1)
-        return (of_model * follows).sum() / follows.sum().clamp(min=1) + (of_clone * weight).mean()
+        of_clone = ((self.clone(states[:, 0]) - actions) ** 2).mean(-1)  # (B,)
+        return self.model.loss(states, actions, follows) + (of_clone * weight).mean()
 
 
 def fit_first_guess(
@@ -104,7 +85,7 @@ def fit_first_guess(
     :param config: of the planner: how windows are drawn and weighed
     :param generator: of the batches
     """
-    guess.move_std.copy_(normalizer.move_std[0])
+    guess.model.move_std.copy_(normalizer.move_std[0])
     optimizer = th.optim.Adam(guess.parameters(), LEARNING_RATE, fused=True)
     scheduler = th.optim.lr_scheduler.CosineAnnealingLR(optimizer, n_updates)
     for _ in range(n_updates):

@@ -6,6 +6,7 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_said.planner.plain import plain_network
 from sb3_said.replay.windows import Windows
 
 
@@ -23,13 +24,7 @@ class RegressionYardstick(nn.Module):
         super().__init__()
         self.max_delay = max_delay
         self.sizes = [obs_dim, act_dim]
-        self.net = nn.Sequential(
-            nn.Linear(obs_dim + max_delay * (act_dim + 1), hidden),
-            nn.ReLU(),
-            nn.Linear(hidden, hidden),
-            nn.ReLU(),
-            nn.Linear(hidden, obs_dim + act_dim),
-        )
+        self.net = plain_network(obs_dim + max_delay * (act_dim + 1), obs_dim + act_dim, hidden)
 
     def forward(self, state: th.Tensor, actions: th.Tensor, delay: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Predict the present (B, obs_dim), normalised, and the decision (B, act_dim), in environment units.

@@ -42,7 +42,7 @@ def test_it_is_a_naive_loop_over_each_window():
         expected, state = [], states[i, 0]
         for k in range(L):
             if 0 < k <= d:
-                state = states[i, k] if known[i, k] else guess.step(state, actions[i, k - 1]).clamp(-10, 10)
+                state = states[i, k] if known[i, k] else guess.model(state, actions[i, k - 1]).clamp(-10, 10)
             expected.append(state)
         th.testing.assert_close(made[i, :, :STATE_DIM], th.stack(expected))
         action = guess.clone(expected[-1]).clamp(-1, 1)
