@@ -217,8 +217,7 @@ class SAIDPolicy(DelayedSACPolicy):
             return super().predict(observation, state, episode_start, deterministic)
         assert self.student is not None
         tensors, is_batch = self.obs_to_tensor(observation)  # SB3's way would set the mode of every module first
-        with th.inference_mode():
-            answers = th.cat([self.student(row) for row in rows_of(tensors)]).cpu().numpy()
+        answers = np.concatenate([self.student.react(row) for row in rows_of(tensors)])
         actions = self._checked(self.unscale_action(answers), observation)
         return actions if is_batch else actions[0], state
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import PyTorchObs
@@ -92,6 +93,28 @@ class Student(nn.Module):
 
     def forward(self, observation: PyTorchObs) -> th.Tensor:
         return self.answer(self.read(observation))
+
+    def react(self, observation: PyTorchObs) -> np.ndarray:
+        """Answer one observation as :meth:`forward` does, in NumPy: (1, act_dim).
+
+        Sixteen calls of torch take five times as long as what they compute (results/student.md).
+        """
+        if isinstance(observation, dict):
+            state, history, age = (observation[key].cpu().numpy() for key in KEYS)
+            since = np.arange(self.max_delay, 0, -1) <= age  # (1, D)
+            parts = state, (history * since[..., None]).reshape(1, -1), age / max(self.max_delay, 1)
+            x = np.concatenate(parts, axis=1)
+        else:
+            x = observation.cpu().numpy()
+        x = (x - self.mean.cpu().numpy()) / self.std.cpu().numpy()
+        *hidden, last = (
+            (layer.weight.detach().cpu().numpy(), layer.bias.detach().cpu().numpy())
+            for layer in self.network
+            if isinstance(layer, nn.Linear)
+        )
+        for weight, bias in hidden:
+            x = np.maximum(x @ weight.T + bias, 0.0)
+        return np.tanh(x @ last[0].T + last[1])
 
     @th.no_grad()
     def fit(self, inputs: th.Tensor) -> None:

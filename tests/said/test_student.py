@@ -3,9 +3,13 @@
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from small_agent import answer, make, observe
 from small_task import Drift, delayed
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_said import SAID
@@ -53,6 +57,24 @@ def test_it_answers_as_the_planner_and_an_untaught_one_does_not(taught):
     error, spread = np.abs(found - wanted).max(), np.abs(wanted - wanted.mean(0)).max()
     assert spread > 0.2 and error < 0.15 * spread < np.abs(2 * untaught.detach().numpy() - wanted).max()
     assert 0 < taught.error < 0.15
+
+
+@given(seed=st.integers(0, 2**31), max_delay=st.integers(0, 5), is_delayed=st.booleans())
+@settings(max_examples=30, deadline=None)
+def test_it_reacts_in_numpy_as_it_learned_in_torch(seed: int, max_delay: int, is_delayed: bool) -> None:
+    generator, state, act_dim = th.Generator().manual_seed(seed), spaces.Box(-np.inf, np.inf, (3,)), 2
+    with th.random.fork_rng(devices=[]):
+        th.manual_seed(seed)
+        action_space = spaces.Box(-1.0, 1.0, (act_dim,))
+        space = delayed_space(state, action_space, max_delay) if is_delayed else state
+        student = Student(space, action_space, 16)
+    obs: PyTorchObs = th.randn(1, 3, generator=generator)
+    if is_delayed:
+        history = 2 * th.rand(1, max_delay, act_dim, generator=generator) - 1
+        age = th.randint(max_delay + 1, (1, 1), generator=generator).float()
+        obs = {"observation": obs, "action_history": history, "delay": age}
+    student.fit(student.read(obs) + th.randn(9, 1, generator=generator))
+    th.testing.assert_close(th.from_numpy(student.react(obs)), student(obs), atol=1e-6, rtol=1e-5)
 
 
 def test_the_labels_are_the_planners_at_temperature_0_at_every_age(taught, monkeypatch):
