@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch as th
 from torch import nn
+from tqdm.auto import tqdm
 
 from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.normalizer import Normalizer
@@ -76,6 +77,7 @@ def fit_first_guess(
     config: PlannerConfig,
     n_updates: int,
     generator: th.Generator,
+    progress_bar: bool = False,
 ) -> None:
     """Train the plain networks with Adam, whose rate falls to 0 by a cosine.
 
@@ -84,11 +86,12 @@ def fit_first_guess(
     :param normalizer: fitted to the source
     :param config: of the planner: how windows are drawn and weighed
     :param generator: of the batches
+    :param progress_bar: show one
     """
     guess.model.move_std.copy_(normalizer.move_std[0])
     optimizer = th.optim.Adam(guess.parameters(), LEARNING_RATE, fused=True)
     scheduler = th.optim.lr_scheduler.CosineAnnealingLR(optimizer, n_updates)
-    for _ in range(n_updates):
+    for _ in tqdm(range(n_updates), desc="first guess", disable=not progress_bar):
         windows = source.sample(BATCH_SIZE, 2, generator, config.early_probability)
         states = normalizer.normalize_states(windows.states)
         weight = window_weight(windows.values, config.weight_factor)

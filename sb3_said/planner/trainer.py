@@ -105,6 +105,7 @@ class PlannerTrainer:
         self.config = planner.config
         self.gradient_steps = gradient_steps
         self.n_updates = 0
+        self._has_guessed = False
         self.device = planner.device
         on_gpu = self.device.type == "cuda"
         if not on_gpu:
@@ -156,8 +157,7 @@ class PlannerTrainer:
 
         :raises FloatingPointError: when an update was not finite (looked at every 100 updates)
         """
-        if self.n_updates == 0:
-            self._make_first_guess()
+        self.make_first_guess()
         rate = learning_rate(self.n_updates, self.gradient_steps, self.config)
         yardstick_rate = rate * YARDSTICK_LEARNING_RATE / self.config.learning_rate
         for optimizer, new in ((self.optimizer, rate), (self.yardstick_optimizer, yardstick_rate)):
@@ -174,13 +174,19 @@ class PlannerTrainer:
         if self.n_updates % 100 == 0:
             self._check_finite()
 
-    def _make_first_guess(self) -> None:
-        """Train what the planner is shown a first guess by, which stays as it is from then on."""
-        guess, n_updates = self.online.first_guess, min(GUESS_UPDATES, GUESS_UPDATES_EACH * self.gradient_steps)
-        if guess is None or self.average.first_guess is None:
+    def make_first_guess(self, progress_bar: bool = False) -> None:
+        """Train what the planner is shown a first guess by, which stays as it is from then on; the first update does.
+
+        :param progress_bar: show one
+        """
+        guess, is_made = self.online.first_guess, self.n_updates > 0 or self._has_guessed
+        if is_made or guess is None or self.average.first_guess is None:
             return
-        fit_first_guess(guess, self.source, self.average.normalizer, self.config, n_updates, self.generator)
+        n_updates = min(GUESS_UPDATES, GUESS_UPDATES_EACH * self.gradient_steps)
+        drawn = self.average.normalizer, self.config, n_updates, self.generator, progress_bar
+        fit_first_guess(guess, self.source, *drawn)
         self.average.first_guess.load_state_dict(guess.requires_grad_(False).state_dict())
+        self._has_guessed = True
 
     def _descend(self) -> tuple[th.Tensor]:
         """Draw a batch, move both sets of weights, and return both losses, (2,), without waiting for the device."""

@@ -388,6 +388,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         intervals = log_interval, eval_interval, save_interval
         training = PlannerTraining(self, trainer, values, lambda n_updates: n_updates, folder, *intervals, watcher)
         self.num_timesteps = trainer.n_updates
+        trainer.make_first_guess(progress_bar)
         watcher.on_training_start(locals() | {"total_timesteps": total, "callback": watcher}, globals())
 
         def on_step(n_updates: int) -> bool:

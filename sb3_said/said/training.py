@@ -94,11 +94,12 @@ class PlannerTraining:
                 self._save_or_warn(clock)
             return outcome == "done" and goes_on
 
-        with tqdm(total=total, initial=trainer.n_updates, desc="planner", disable=not progress_bar) as bar:
-            try:
+        try:
+            trainer.make_first_guess(progress_bar)
+            with tqdm(total=total, initial=trainer.n_updates, desc="planner", disable=not progress_bar) as bar:
                 trainer.train(callback=on_update)
-            except KeyboardInterrupt:
-                outcome = "interrupted"
+        except KeyboardInterrupt:
+            outcome = "interrupted"
         if outcome == "interrupted":
             result = "keeps what it learned" if trainer.n_updates > 0 else "stays as it was"
             print(f"Planner training interrupted after {trainer.n_updates} of {total} updates; it {result}.")

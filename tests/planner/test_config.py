@@ -15,7 +15,7 @@ def test_paper_config_is_the_papers_table():
     expected |= {"action_transform": "tanh", "scored_states": "all", "batch_size": 256, "learning_rate": 2e-4}
     expected |= {"ema_decay": 0.9999, "weight_factor": 2.0, "warmup_steps": 0, "gradient_clip": None}
     expected |= {"value_scale": "centred", "precision": "float32", "end_time_probability": 0.0}
-    expected |= {"early_probability": 0.0}
+    expected |= {"early_probability": 0.0, "first_guess": False}
     assert expected.items() <= dataclasses.asdict(config).items()
     assert PlannerConfig.paper(sampling_steps=2).sampling_steps == 2
 

@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner import planner as planner_module
 from sb3_said.planner.diffusion import END_TIMES, START_TIME
+from sb3_said.planner.first_guess import FARTHEST
 
 OBS, ACT, DELAY, N = 4, 2, 3, 8
 CONFIG = PlannerConfig(
@@ -86,6 +87,18 @@ def naive_network(net, x, context, t):
     return net.out(norm(tokens, next(parts), next(parts)))
 
 
+def naive_guess(planner, observation, history, d):
+    """What the network is shown of the plain networks' window, step after step: (d + horizon, 2 * OBS + ACT)."""
+    rows, first = [], planner.normalizer.normalize_states(observation)
+    state = first
+    for k in range(d + planner.config.horizon):
+        action = planner.first_guess.clone(state).clamp(-1, 1) if k >= d else th.zeros(ACT)
+        rows.append(th.cat([state, action, state - first]))
+        if k < d:
+            state = planner.first_guess.model(state, history[DELAY - d + k]).clamp(-FARTHEST, FARTHEST)
+    return th.stack(rows)
+
+
 @th.no_grad()
 def naive_plan(planner, observation, history, d, noise):
     """DDIM, window after window of d + horizon steps: (N, d + horizon, OBS + ACT), in the planner's units."""
@@ -97,7 +110,8 @@ def naive_plan(planner, observation, history, d, noise):
     given[0, :OBS] = observation
     given[:d, OBS:] = history[DELAY - d :]
     clean = planner.normalizer.normalize(given[:, :OBS], given[:, OBS:])
-    context = planner.network.context(clean[None], known[None])[0]
+    guess = naive_guess(planner, observation, history, d)
+    context = planner.network.context(clean[None], known[None], guess[None])[0]
     windows = []
     for x in planner.config.temperature * noise[:, :length]:
         x = th.where(known, clean, x)
