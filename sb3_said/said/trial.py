@@ -119,10 +119,20 @@ def best_share(planner: np.ndarray, expert: np.ndarray, ages: np.ndarray) -> tup
     return means[best], ups[best]
 
 
-def let_the_best_answer(model: SAID, n_episodes: int, progress_bar: bool = False) -> dict[str, float]:
-    """Let the planner decide in its best way, and the expert answer at the ages at which it does better.
+def is_surely_better(returns: np.ndarray, than: np.ndarray) -> bool:
+    """Tell whether returns (n,) are better than others of the same episodes by more than the standard error of that.
 
-    Warn where that is at all of them.
+    Of many shares some look better by chance; for so much more than it costs to find out, the simpler answer stays.
+    """
+    gain = returns - than
+    error = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else np.inf
+    return bool(gain.mean() > error)
+
+
+def let_the_best_answer(model: SAID, n_episodes: int, progress_bar: bool = False) -> dict[str, float]:
+    """Let the planner in its best way answer, or the expert, or both: the expert at the ages at which it does better.
+
+    Both answer where that :func:`is_surely_better` than either alone. Warn where the expert alone does.
 
     :return: mean returns, the expert's largest age, and the number of steps played, for the log
     """
@@ -130,10 +140,12 @@ def let_the_best_answer(model: SAID, n_episodes: int, progress_bar: bool = False
     expert = trial.returns["expert"]
     ways = [name for name in trial.returns if name != "expert"]
     shares = {name: best_share(trial.returns[name], expert, trial.ages) for name in ways}
+    alone = max(trial.returns, key=lambda name: trial.returns[name].mean())
     way = max(ways, key=lambda name: shares[name][0])
     up_to = shares[way][1]
-    if np.isinf(up_to):
+    if not is_surely_better(np.where(trial.ages <= up_to, expert, trial.returns[way]), trial.returns[alone]):
         way = max(ways, key=lambda name: trial.returns[name].mean())
+        up_to = np.inf if alone == "expert" else -1.0
     model.set_planner(**model.planner_ways.get(way, {}))
     if 0 <= up_to < model.policy.max_delay:
         model.set_answer("both", int(up_to))

@@ -114,8 +114,28 @@ def test_the_best_share_is_that_of_all(rows):
     assert np.isinf(up_to) == (expert.mean() > max(every[: int(ages.max()) + 1]) + 1e-12)
 
 
+def test_both_answer_only_where_that_is_surely_better():
+    """The paired differences' mean has to exceed their standard error."""
+    base = np.array([10.0, -7.0, 3.0, 3.0])
+    gain = np.array([0.0, 2.0, 0.0, 2.0])  # standard deviation sqrt(4 / 3), of the mean half of it: 0.577
+    assert trial.is_surely_better(base + gain - 0.4, base) and not trial.is_surely_better(base + gain - 0.45, base)
+    assert not trial.is_surely_better(base, base)
+    assert not trial.is_surely_better(np.array([2.0]), np.array([1.0]))  # one episode tells nothing of its chance
+
+
+def test_a_share_by_chance_is_none(monkeypatch):
+    """At one age of two the expert is better, by so little that four episodes do not tell."""
+    returns = {"planner": np.array([4.0, 9.0, 4.0, 9.0]), "expert": np.array([4.1, 1.0, 3.95, 1.0])}
+    found = trial.Trial(returns, np.array([0.0, 2.0, 0.0, 2.0]), 7)
+    assert trial.best_share(*returns.values(), found.ages)[1] == 1.0
+    monkeypatch.setattr(trial, "play_trial", lambda *_: found)
+    model = make(env=pendulum(delay=(0, 2)), planner_trial_episodes=2).learn(60)
+    assert model.policy.who_answers == "planner"
+
+
 def test_both_answer_where_each_does_better(monkeypatch, tmp_path):
-    found = trial.Trial({"planner": np.array([5.0, 1.0]), "expert": np.array([1.0, 3.0])}, np.array([2.0, 0.0]), 7)
+    returns = {"planner": np.array([5.0, 1.0, 5.1, 1.1]), "expert": np.array([1.0, 3.0, 1.1, 3.1])}
+    found = trial.Trial(returns, np.array([2.0, 0.0, 2.0, 0.0]), 7)
     monkeypatch.setattr(trial, "play_trial", lambda *_: found)
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message="The planner is worse than its expert")
