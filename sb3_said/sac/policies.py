@@ -119,6 +119,19 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
 
         :param observation: one observation or a batch of them, of any numbers
         :return: tensors with a batch dimension, and whether they had one before
+        :raises ValueError: as :meth:`obs_to_arrays`
+        """
+        arrays, is_batch = self.obs_to_arrays(observation)
+        # SB3's own method cannot reshape an action history of no actions, that of max_delay 0.
+        device = self.device  # which SB3 looks for among all parameters
+        tensors = {key: th.as_tensor(x, device=device) for key, x in arrays.items()}
+        return tensors if isinstance(self.observation_space, spaces.Dict) else tensors["observation"], is_batch
+
+    def obs_to_arrays(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], bool]:
+        """Turn what ``predict`` was given into float32 arrays of their own memory, after checking it.
+
+        :param observation: one observation or a batch of them, of any numbers
+        :return: arrays (B, ...) by key, "observation" alone without delay, and whether there was a batch before
         :raises ValueError: for entries that are no numbers or not finite in float32, another shape, an empty batch,
             other keys, an age outside 0..max_delay, or a ``state_known`` other than 0 and 1
         """
@@ -143,10 +156,8 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
             raise ValueError(f"The parts of an observation differ in how many there are: {batches}.")
         if is_delayed:
             _check_delayed(arrays, self.max_delay)
-        # SB3's own method cannot reshape an action history of no actions, that of max_delay 0.
-        is_batch, device = batches["observation"] is not None, self.device  # which SB3 looks for among all parameters
-        tensors = {key: th.as_tensor(x if is_batch else x[None], device=device) for key, x in arrays.items()}
-        return tensors if is_delayed else tensors["observation"], is_batch
+        is_batch = batches["observation"] is not None
+        return arrays if is_batch else {key: x[None] for key, x in arrays.items()}, is_batch
 
     def predict(
         self,

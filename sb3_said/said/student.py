@@ -15,6 +15,7 @@ from tqdm.auto import tqdm
 
 from sb3_said.delays.space import KEYS, check_spaces
 from sb3_said.sac.extractors import StateAugmentedExtractor
+from sb3_said.sac.policies import as_array
 
 SAID = Any  # whose module imports this one
 HELD_OUT = 0.05  # of the replay's labels
@@ -94,27 +95,25 @@ class Student(nn.Module):
     def forward(self, observation: PyTorchObs) -> th.Tensor:
         return self.answer(self.read(observation))
 
-    def react(self, observation: PyTorchObs) -> np.ndarray:
+    def react(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         """Answer one observation as :meth:`forward` does, in NumPy: (1, act_dim).
 
         Sixteen calls of torch take five times as long as what they compute (results/student.md).
+
+        :param observation: arrays (1, ...) by key, "observation" alone without delay
         """
-        if isinstance(observation, dict):
-            state, history, age = (observation[key].cpu().numpy() for key in KEYS)
+        x = observation[KEYS[0]]
+        if self.reader is not None:
+            history, age = observation[KEYS[1]], observation[KEYS[2]]
             since = np.arange(self.max_delay, 0, -1) <= age  # (1, D)
-            parts = state, (history * since[..., None]).reshape(1, -1), age / max(self.max_delay, 1)
-            x = np.concatenate(parts, axis=1)
-        else:
-            x = observation.cpu().numpy()
-        x = (x - self.mean.cpu().numpy()) / self.std.cpu().numpy()
-        *hidden, last = (
-            (layer.weight.detach().cpu().numpy(), layer.bias.detach().cpu().numpy())
-            for layer in self.network
-            if isinstance(layer, nn.Linear)
-        )
-        for weight, bias in hidden:
-            x = np.maximum(x @ weight.T + bias, 0.0)
-        return np.tanh(x @ last[0].T + last[1])
+            x = np.concatenate(
+                [x, (history * since[..., None]).reshape(1, -1), age / max(self.max_delay, 1)], axis=1, dtype=np.float32
+            )
+        x = (x - as_array(self.mean)) / as_array(self.std)
+        *hidden, last = (layer for layer in self.network if isinstance(layer, nn.Linear))
+        for layer in hidden:
+            x = np.maximum(x @ as_array(layer.weight).T + as_array(layer.bias), 0.0)
+        return np.tanh(x @ as_array(last.weight).T + as_array(last.bias))
 
     @th.no_grad()
     def fit(self, inputs: th.Tensor) -> None:
@@ -221,7 +220,7 @@ def _replayed(model: SAID, config: Distillation, generator: th.Generator) -> _Ro
 def _visited(model: SAID, who: str, n_steps: int, generator: th.Generator) -> _Rows:
     """Play the training environment, and label where that leads."""
     visited: list[dict[str, th.Tensor]] = []
-    with model.borrowed_env() as env, model.policy.answering(who):
+    with model.borrowed_env() as env, model.policy.answering(who, at_once=True):
         env.seed(int(th.randint(2**31, (), generator=generator)))
         obs: Any = env.reset()
         for _ in range(-(-n_steps // env.num_envs)):

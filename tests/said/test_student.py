@@ -77,7 +77,8 @@ def test_it_reacts_in_numpy_as_it_learned_in_torch(seed: int, max_delay: int, is
         age = th.randint(max_delay + 1, (1, 1), generator=generator).float()
         obs = {"observation": obs, "action_history": history, "delay": age}
     student.fit(student.read(obs) + th.randn(9, 1, generator=generator))
-    th.testing.assert_close(th.from_numpy(student.react(obs)), student(obs), atol=1e-6, rtol=1e-5)
+    arrays = {key: x.numpy() for key, x in (obs if isinstance(obs, dict) else {"observation": obs}).items()}
+    th.testing.assert_close(th.from_numpy(student.react(arrays)), student(obs), atol=1e-6, rtol=1e-5)
 
 
 def test_the_labels_are_the_planners_at_temperature_0_at_every_age(taught, monkeypatch):
