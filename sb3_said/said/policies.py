@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import fields, replace
 from itertools import product
 from typing import Any, Literal, get_args
 
@@ -34,7 +34,8 @@ class SAIDPolicy(DelayedSACPolicy):
 
     :param planner_kwargs: fields of :class:`~sb3_said.planner.PlannerConfig`
     :param value: who values planned states: ``"critics"``, the expert's, by min Q(s, a); or ``"iql"``, a V(s) of its
-        own (see :class:`~sb3_said.offline.ImplicitValues`)
+        own (see :class:`~sb3_said.offline.ImplicitValues`), which scores the states after the decision where
+        ``scored_states`` is ``"decision"``: no action shows in V of the present that all candidates share
     :param student_width: of the hidden layers of a :class:`~sb3_said.said.student.Student`; None for none
     :param policy_kwargs: of :class:`~sb3_said.sac.DelayedSACPolicy`
     :raises ValueError: for an unknown planner setting, a delayed task whose critics do not read the true state, or a
@@ -66,6 +67,7 @@ class SAIDPolicy(DelayedSACPolicy):
             raise ValueError(f"The planner has no setting {', '.join(unknown)}; it has {', '.join(names)}.")
         self.register_buffer("planner_updates", th.zeros(()))
         self.register_buffer("expert_preferred", th.zeros(()))  # part of the ages, from 0 on, at which it answers
+        self.values: ImplicitValues | None = None
         with th.random.fork_rng(devices=[]):  # the expert learns as it would without a planner
             self.make_planner(PlannerConfig(**given))
             self.set_value(value)
@@ -77,11 +79,13 @@ class SAIDPolicy(DelayedSACPolicy):
                 "DelayedObservationWrapper."
             )
         self._answer: Answer | None = None
+        self._at_once = False
 
     def make_planner(self, config: PlannerConfig) -> None:
         """Take a new, untrained planner of these settings."""
         state_space, max_delay = check_spaces(self.observation_space, self.action_space)
         obs_dim, act_dim = state_space.shape[0], self.action_space.shape[0]  # type: ignore[index]  # a Box has a shape
+        config = self._scored(config)
         self.planner = InpaintingPlanner(obs_dim, act_dim, max_delay, config).to(self.device).requires_grad_(False)
         self.planner_updates.zero_()
         self.expert_preferred.zero_()
@@ -93,10 +97,16 @@ class SAIDPolicy(DelayedSACPolicy):
         """
         if value not in get_args(Value):
             raise ValueError(f"value is {value!r}, expected one of {', '.join(get_args(Value))}.")
-        self.values: ImplicitValues | None = None
+        self.values = None
         if value == "iql":
             state_space, _ = check_spaces(self.observation_space, self.action_space)
             self.values = ImplicitValues(state_space.shape[0], self.action_space.shape[0]).to(self.device)  # type: ignore[index]  # a Box has a shape
+            self.planner.config = self._scored(self.planner.config)
+
+    def _scored(self, config: PlannerConfig) -> PlannerConfig:
+        """Return settings under which V(s), where there is one, tells candidates apart."""
+        is_blind = self.values is not None and config.scored_states == "decision"
+        return replace(config, scored_states="future") if is_blind else config
 
     def make_student(self, width: int | None) -> None:
         """Take a new, untrained student, or none."""
@@ -162,19 +172,35 @@ class SAIDPolicy(DelayedSACPolicy):
             self.student.preferred.fill_(float(who == "student"))
 
     @contextmanager
-    def answering(self, who: Answer) -> Iterator[None]:
+    def answering(self, who: Answer, at_once: bool = False) -> Iterator[None]:
         """Let one of them answer ``predict`` for a while, whoever would otherwise.
 
         :param who: as of :meth:`set_answer`
+        :param at_once: answer the rows of a batch together where no noise is drawn: several times as fast, but an
+            answer then differs by rounding from that to the row alone
         :raises ValueError: for another name, for a planner that is not trained, for no student, or for ``"both"`` where
             no age was set
         """
         self._check_answer(who)
-        before, self._answer = self._answer, who
+        before = self._answer, self._at_once
+        self._answer, self._at_once = who, at_once
         try:
             yield
         finally:
-            self._answer = before
+            self._answer, self._at_once = before
+
+    @contextmanager
+    def preferring_who_answers(self) -> Iterator[None]:
+        """Hold for a while, in what a file keeps, who answers inside :meth:`answering`."""
+        parts = [self.expert_preferred] if self.student is None else [self.expert_preferred, self.student.preferred]
+        before = [part.clone() for part in parts]
+        if self._answer is not None:
+            self.set_answer(self._answer, self.expert_up_to if self._answer == "both" else None)
+        try:
+            yield
+        finally:
+            for part, value in zip(parts, before, strict=True):
+                part.copy_(value)
 
     def _check_answer(self, who: Answer) -> None:
         if who not in get_args(Answer):
@@ -216,8 +242,9 @@ class SAIDPolicy(DelayedSACPolicy):
         if self.who_answers != "student":
             return super().predict(observation, state, episode_start, deterministic)
         assert self.student is not None
-        tensors, is_batch = self.obs_to_tensor(observation)  # SB3's way would set the mode of every module first
-        answers = np.concatenate([self.student.react(row) for row in rows_of(tensors)])
+        arrays, is_batch = self.obs_to_arrays(observation)  # SB3's way would set the mode of every module first
+        rows = ({key: x[i : i + 1] for key, x in arrays.items()} for i in range(len(arrays["observation"])))
+        answers = np.concatenate([self.student.react(row) for row in rows])
         actions = self._checked(self.unscale_action(answers), observation)
         return actions if is_batch else actions[0], state
 
@@ -225,19 +252,28 @@ class SAIDPolicy(DelayedSACPolicy):
         who = self.who_answers
         if not deterministic and who != "both":
             return self._plan(observation).action if who == "planner" else super()._predict(observation)
-        # Each row alone: matrix products of another batch size round differently, and can change the candidate chosen.
-        return th.cat([
-            super(SAIDPolicy, self)._predict(row, deterministic)
-            if self._is_experts(row, who)
-            else self._plan(row, repeats=deterministic).action
-            for row in rows_of(observation)
-        ])  # fmt: skip
+        is_experts = self._is_experts(observation, who)  # (B,)
+        if self._at_once and self.planner.config.temperature == 0:
+            groups = [rows for rows in (is_experts.nonzero()[:, 0], (~is_experts).nonzero()[:, 0]) if len(rows)]
+        else:
+            # Each row alone: products of another batch size round differently, and can change the candidate chosen
+            groups = list(th.arange(len(is_experts)).split(1))
+        actions = th.empty(len(is_experts), self.planner.act_dim, device=self.device)
+        for rows in groups:
+            part = {k: x[rows] for k, x in observation.items()} if isinstance(observation, dict) else observation[rows]
+            actions[rows] = (
+                super()._predict(part, deterministic)
+                if is_experts[rows[0]]
+                else self._plan(part, repeats=deterministic).action
+            )
+        return actions
 
-    def _is_experts(self, row: PyTorchObs, who: Answer) -> bool:
-        """Tell whether the expert decides for an observation."""
-        if who != "both":
-            return who == "expert"
-        return isinstance(row, dict) and float(row[KEYS[2]]) < self.expert_ages
+    def _is_experts(self, observation: PyTorchObs, who: Answer) -> th.Tensor:
+        """Tell for which observations the expert decides: (B,) bool."""
+        if who == "both" and isinstance(observation, dict):
+            return observation[KEYS[2]][:, 0] < self.expert_ages
+        n = len(observation[KEYS[0]] if isinstance(observation, dict) else observation)
+        return th.full((n,), who == "expert", device=self.device)
 
     def predict_plan(self, observation: np.ndarray | dict[str, np.ndarray], deterministic: bool = False) -> np.ndarray:
         """Return the action that :meth:`predict` does, and those planned for the steps after it.
@@ -259,8 +295,7 @@ class SAIDPolicy(DelayedSACPolicy):
             plan = self._plan(row, repeats=deterministic)
             later = plan.actions[:, :, -config.horizon :]  # (1, N, K, act_dim)
             chosen = choose(later.flatten(2), plan.values, config.choice_factor).view(1, *later.shape[2:])
-            is_experts = self._is_experts(row, who)
-            first = super()._predict(row, deterministic) if is_experts else plan.action
+            first = super()._predict(row, deterministic) if self._is_experts(row, who) else plan.action
             planned.append(th.cat([first[:, None], chosen[:, 1:]], dim=1))
         return self._checked(self.unscale_action(th.cat(planned).cpu().numpy()), observation)
 

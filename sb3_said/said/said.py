@@ -18,6 +18,7 @@ from stable_baselines3.common.utils import configure_logger
 from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from sb3_said.delays.space import ages_of, has_state_history
+from sb3_said.files.archive import PathOrFile
 from sb3_said.offline import IQL, ImplicitValues, OfflineAlgorithm, load_dataset
 from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.planner.trainer import PlannerTrainer
@@ -177,6 +178,14 @@ class SAID(OfflineAlgorithm, StableSAC):
                 progress_bar,
             )
 
+    def save(self, path: PathOrFile, compact: bool = False) -> None:  # type: ignore[override]  # no exclude, include
+        """Write the agent to a file, which answers as the agent does now; amid ``learn`` that is the expert.
+
+        The arguments are those of :meth:`DelayedSAC.save`.
+        """
+        with self.policy.preferring_who_answers():
+            super().save(path, compact)
+
     def set_planner(self, **settings: Any) -> None:
         """Change how the planner answers, also after training or loading; ``save`` keeps the change.
 
@@ -184,12 +193,18 @@ class SAID(OfflineAlgorithm, StableSAC):
 
         :param settings: ``sampling_steps``, ``n_candidates``, ``temperature``, ``scored_states`` or ``choice_factor``
             of :class:`~sb3_said.planner.PlannerConfig`
-        :raises ValueError: for other settings, which the weights depend on, and for values outside their range
+        :raises ValueError: for other settings, which the weights depend on, for values outside their range, and for
+            ``scored_states="decision"`` where V(s) scores, in which no action shows
         """
         if others := sorted(set(settings) - set(SAMPLING_SETTINGS)):
             raise ValueError(
                 f"Only {', '.join(SAMPLING_SETTINGS)} can be changed, got {', '.join(others)}; "
                 "give it as planner_kwargs of a new agent."
+            )
+        if settings.get("scored_states") == "decision" and self.policy.values is not None:
+            raise ValueError(
+                "scored_states='decision' scores candidates at the present that they share, where V(s) tells no action "
+                "from another: use 'future' or 'all'."
             )
         self.policy.planner.config = replace(self.policy.planner.config, **settings)
 
@@ -325,7 +340,7 @@ class SAID(OfflineAlgorithm, StableSAC):
             self.set_answer("planner")
             n_episodes = self.planner_trial_episodes if trial_episodes is None else trial_episodes
             if outcome == "done" and n_episodes > 0 and self.env is not None:
-                training.log(let_the_best_answer(self, n_episodes, progress_bar))
+                training.log(let_the_best_answer(self, n_episodes, progress_bar, should_stop))
         if outcome == "stopped":
             raise KeyboardInterrupt
         self._planner_trained_at = self.num_timesteps
@@ -381,9 +396,9 @@ class SAID(OfflineAlgorithm, StableSAC):
         :raises ValueError: as ``load_dataset`` and :meth:`train_planner` do
         """
         total = self.planner_gradient_steps if gradient_steps is None else gradient_steps
+        watcher = self._begin_offline(dataset, total, callback, tb_log_name, True, progress_bar)
         self.value, self.planner_newest_fraction = "iql", 1.0  # no step of a log is newer than another
         self.policy.set_value("iql")
-        watcher = self._begin_offline(dataset, total, callback, tb_log_name, True, progress_bar)
         trainer, values = self.make_planner_trainer(total), self._make_value_trainer()
         intervals = log_interval, eval_interval, save_interval
         training = PlannerTraining(self, trainer, values, lambda n_updates: n_updates, folder, *intervals, watcher)

@@ -34,7 +34,7 @@ class PlannerTraining:
     :param eval_interval: updates between two measurements of the held-out errors, beside the regression's
     :param save_interval: updates between two checkpoints; by default time decides, as for those of environment steps
     :param watcher: whose ``EvalCallback`` evaluations the checkpoint keeps, too
-    :raises SavedFileError: when the checkpoint is damaged, or of a training with other settings
+    :raises SavedFileError: when the checkpoint is damaged, of a training with other settings, or of one on other logs
     """
 
     def __init__(
@@ -63,6 +63,8 @@ class PlannerTraining:
                     if values is not None:
                         values.load_state_dict(state["values"])
                     restore_evaluations(watcher, state.get("evaluations", []))
+                elif watcher is not None:  # learning from logs, which one training in a folder does
+                    raise ValueError("it is of a training on other data; give the same logs, or another folder")
 
     def run(
         self,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -33,9 +34,10 @@ class Trial:
     """of "planner", those of ``planner_ways`` that differ from it, and "expert", (n_episodes,), undiscounted, in the
     task's own rewards"""
     ages: np.ndarray
-    """(n_episodes,) median age of the observations of each, amid the episode, in control steps"""
+    """(n_episodes,) age of the observations of each, amid the episode, in control steps; 0 for all where it changes
+    within episodes, which then differ in it from player to player"""
     n_steps: int
-    """played by all together"""
+    """taken by all together, those of environments that wait for the others, too"""
 
 
 def ways_of(given: dict[str, dict[str, Any]] | None, planner_kwargs: dict[str, Any]) -> dict[str, dict[str, Any]]:
@@ -55,7 +57,9 @@ def ways_of(given: dict[str, dict[str, Any]] | None, planner_kwargs: dict[str, A
     return given
 
 
-def play_trial(model: SAID, n_episodes: int, progress_bar: bool = False) -> Trial:
+def play_trial(
+    model: SAID, n_episodes: int, progress_bar: bool = False, should_stop: Callable[[], bool] | None = None
+) -> Trial:
     """Play the training environment with the planner, in each of its ways, and with the expert, from the same seed.
 
     These are environment steps beyond those of ``learn``.
@@ -63,43 +67,57 @@ def play_trial(model: SAID, n_episodes: int, progress_bar: bool = False) -> Tria
     :param model: with a trained planner and an environment; stays as it is
     :param n_episodes: for each
     :param progress_bar: show one
+    :param should_stop: asked after every step
+    :raises KeyboardInterrupt: when ``should_stop`` has ended the trial
     """
     seed, own = int(np.random.randint(2**31)), model.policy.planner.config
     ways = {name: replace(own, **settings) for name, settings in model.planner_ways.items()}
     others = {name: config for name, config in ways.items() if config != own}
-    returns, n_steps = {}, 0
+    returns, ages, n_steps = {}, {}, 0
     try:
         with model.borrowed_env() as env:
             for name, config in {"planner": own, **others, "expert": own}.items():
                 model.policy.planner.config = config
                 env.seed(seed)
                 who = "expert" if name == "expert" else "planner"
-                with model.policy.answering(who), tqdm(total=n_episodes, desc=name, disable=not progress_bar) as bar:
-                    returns[name], ages, n_played = _play(model, env, n_episodes, bar)
+                bar = tqdm(total=n_episodes, desc=name, disable=not progress_bar)
+                with bar, model.policy.answering(who, at_once=True):
+                    returns[name], ages[name], n_played = _play(model, env, n_episodes, bar, should_stop)
                 n_steps += n_played
     finally:
         model.policy.planner.config = own
-    return Trial(returns, ages, n_steps)
+    oldest = np.max(list(ages.values()), axis=0)  # whoever falls at once meets young observations alone
+    return Trial(returns, np.zeros(n_episodes) if np.isnan(oldest).any() else oldest, n_steps)
 
 
-def _play(model: SAID, env: VecEnv, n_episodes: int, bar: tqdm) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return the episodes' returns and ages, by environment and not by whose ended first, and the steps of all."""
+def _play(
+    model: SAID, env: VecEnv, n_episodes: int, bar: tqdm, should_stop: Callable[[], bool] | None
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Return the episodes' returns and ages, by environment and not by whose ended first, and the steps taken.
+
+    The age of an episode is NaN where it changes.
+    """
     ages: list[list[float]] = [[] for _ in range(env.num_envs)]
     ended: list[tuple[int, float]] = []  # environment and age of each episode
+    n_steps, last = 0, None
 
     def on_step(played: dict[str, Any], _: dict[str, Any]) -> None:
+        nonlocal n_steps, last
         i, observation = played["i"], played["observations"]
+        if played["rewards"] is not last:  # called for each environment that has an episode to play
+            n_steps, last = n_steps + env.num_envs, played["rewards"]
         ages[i].append(float(observation[KEYS[2]][i, 0]) if isinstance(observation, dict) else 0.0)
         if played["done"]:
             settled = ages[i][model.policy.max_delay :] or ages[i][-1:]  # before, the episode is young
-            ended.append((i, float(np.median(settled))))
+            ended.append((i, settled[0] if len(set(settled)) == 1 else np.nan))
             ages[i].clear()
             bar.update()
+        if should_stop is not None and should_stop():
+            raise KeyboardInterrupt
 
     played: Any = evaluate_policy(model, env, n_episodes, callback=on_step, return_episode_rewards=True, warn=False)
-    returns, lengths = played
     order = np.argsort([i for i, _ in ended], kind="stable")
-    return np.asarray(returns)[order], np.array([age for _, age in ended])[order], sum(lengths)
+    return np.asarray(played[0])[order], np.array([age for _, age in ended])[order], n_steps
 
 
 def best_share(planner: np.ndarray, expert: np.ndarray, ages: np.ndarray) -> tuple[float, float]:
@@ -119,31 +137,34 @@ def best_share(planner: np.ndarray, expert: np.ndarray, ages: np.ndarray) -> tup
     return means[best], ups[best]
 
 
-def is_surely_better(returns: np.ndarray, than: np.ndarray) -> bool:
-    """Tell whether returns (n,) are better than others of the same episodes by more than the standard error of that.
+def gains_more_than_its_error(returns: np.ndarray, than: np.ndarray) -> bool:
+    """Tell whether returns (n,) are better than others of the same episodes by more than one standard error of that.
 
-    Of many shares some look better by chance; for so much more than it costs to find out, the simpler answer stays.
+    Of many shares some look better by chance. One error is a low bar: where ten episodes of two equal players are
+    compared, a share passes in a fifth of the cases, and loses nothing.
     """
     gain = returns - than
     error = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else np.inf
     return bool(gain.mean() > error)
 
 
-def let_the_best_answer(model: SAID, n_episodes: int, progress_bar: bool = False) -> dict[str, float]:
+def let_the_best_answer(
+    model: SAID, n_episodes: int, progress_bar: bool = False, should_stop: Callable[[], bool] | None = None
+) -> dict[str, float]:
     """Let the planner in its best way answer, or the expert, or both: the expert at the ages at which it does better.
 
-    Both answer where that :func:`is_surely_better` than either alone. Warn where the expert alone does.
+    Both answer where that :func:`gains_more_than_its_error` over either alone. Warn where the expert alone does.
 
     :return: mean returns, the expert's largest age, and the number of steps played, for the log
     """
-    trial = play_trial(model, n_episodes, progress_bar)
+    trial = play_trial(model, n_episodes, progress_bar, should_stop)
     expert = trial.returns["expert"]
     ways = [name for name in trial.returns if name != "expert"]
     shares = {name: best_share(trial.returns[name], expert, trial.ages) for name in ways}
     alone = max(trial.returns, key=lambda name: trial.returns[name].mean())
     way = max(ways, key=lambda name: shares[name][0])
     up_to = shares[way][1]
-    if not is_surely_better(np.where(trial.ages <= up_to, expert, trial.returns[way]), trial.returns[alone]):
+    if not gains_more_than_its_error(np.where(trial.ages <= up_to, expert, trial.returns[way]), trial.returns[alone]):
         way = max(ways, key=lambda name: trial.returns[name].mean())
         up_to = np.inf if alone == "expert" else -1.0
     model.set_planner(**model.planner_ways.get(way, {}))

@@ -7,7 +7,7 @@ import json
 import math
 import sys
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, SupportsFloat
@@ -24,7 +24,7 @@ from sb3_said.offline.scores import normalized_score, reference_returns
 from sb3_said.offline.writing import check_target, write_dataset
 from sb3_said.zoo.arguments import add_delay, add_playing, check_positive, explained, make_parser, read_delay
 from sb3_said.zoo.manager import ALGOS
-from sb3_said.zoo.runs import LoadedRun, load_run, origin
+from sb3_said.zoo.runs import LoadedRun, answering, load_run, origin
 
 EPILOG = """\
 examples:
@@ -66,11 +66,14 @@ class Episode:
 
 
 class Recorder(gym.Wrapper[Any, Any, Any, Any]):
-    """Adds each episode that ends to a list, with the true states of a delayed task."""
+    """Adds each episode that ends to a list, with the true states of a delayed task.
 
-    def __init__(self, env: gym.Env[Any, Any], episodes: list[Episode]):
+    :param on_step: called after each step
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], episodes: list[Episode], on_step: Callable[[], None] | None = None):
         super().__init__(env)
-        self.episodes = episodes
+        self.episodes, self.on_step = episodes, on_step
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(**kwargs)
@@ -88,6 +91,8 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         if terminated or truncated:
             self.episode.terminated = terminated
             self.episodes.append(self.episode)
+        if self.on_step is not None:
+            self.on_step()
         return observation, reward, terminated, truncated, info
 
 
@@ -214,26 +219,31 @@ def play(share: Share, n_steps: int, seed: int, n_envs: int, deterministic: bool
     """
     episodes: list[Episode] = []
     kept: list[Episode] = []
-    used, left = 0, n_steps
+    used, left, full = 0, n_steps, bar.n + n_steps
+
+    def on_step() -> None:
+        if bar.n < full:  # steps of the last episodes are cut off
+            bar.update()
 
     def make_env() -> gym.Env[Any, Any]:
-        return Recorder(share.run.make_env(), episodes)
+        return Recorder(share.run.make_env(), episodes, on_step)
 
     env = share.run.make_env()
     check_spaces(env.observation_space, env.action_space)
     agent = NoisyAgent(share.run.model, env.action_space, share.noise, seed)  # type: ignore[arg-type]  # it is a Box
     env.close()
     player = replace(share.run, model=agent, make_env=make_env)  # type: ignore[arg-type]  # it has predict
+    who = getattr(getattr(share.run.model, "policy", None), "who_answers", None)
     while left > 0:
         lengths = [len(episode.rewards) for episode in kept]
         n_episodes = max(n_envs, math.ceil(left / np.mean(lengths))) if lengths else n_envs
-        player.play(n_episodes, seed + used, n_envs, deterministic=deterministic)
+        with answering(share.run.model, who, at_once=True):
+            player.play(n_episodes, seed + used, n_envs, deterministic=deterministic)
         used += n_episodes
         for episode in episodes:
             if left > 0:
                 kept.append(episode.cut(left))
                 left -= len(kept[-1].rewards)
-                bar.update(len(kept[-1].rewards))
         episodes.clear()
     return kept
 

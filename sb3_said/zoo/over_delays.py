@@ -275,7 +275,7 @@ def play(
     """Play the episodes of a cell."""
     with at_any_age():
         run = load_run(cell.file, cell.algo, env_id, cell.delay, device, gym_packages=gym_packages)
-        with answering(run.model, cell.answer):
+        with answering(run.model, cell.answer, at_once=True):
             played = run.play(episodes, seed, n_envs, age_error=cell.age_error)
     measured = played.terminated, played.action_changes
     return Summary.from_episodes(cell.agent, played.returns, played.lengths, None, *measured)

@@ -183,16 +183,17 @@ def answers(model: BaseAlgorithm) -> list[str | None]:
     return [who for who in found if who != "expert" or model._n_updates > 0] or found
 
 
-def answering(model: BaseAlgorithm, answer: str | None) -> AbstractContextManager[Any]:
+def answering(model: BaseAlgorithm, answer: str | None, at_once: bool = False) -> AbstractContextManager[Any]:
     """Let one of ``answers(model)`` answer inside the context; None leaves the model as it is.
 
+    :param at_once: as of :meth:`SAIDPolicy.answering`
     :raises ValueError: for an answer that the model does not have
     """
     if answer is None:
         return nullcontext()
     if not hasattr(model.policy, "answering"):
         raise ValueError(f"This {type(model).__name__} cannot answer as {answer!r}: only a SAID agent has an expert.")
-    context: AbstractContextManager[Any] = model.policy.answering(answer)  # type: ignore[operator]
+    context: AbstractContextManager[Any] = model.policy.answering(answer, at_once)  # type: ignore[operator]
     return context
 
 

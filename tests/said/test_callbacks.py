@@ -425,3 +425,23 @@ def test_a_checkpoint_of_something_else_is_refused(state, tmp_path):
 def test_unknown_intervals_are_refused_before_the_training():
     with pytest.raises(TypeError, match="no argument save_freq"):
         PlannerTrainingCallback(save_freq=5)
+
+
+def test_a_file_of_a_second_training_answers_as_the_callback_saw_it(tmp_path):
+    """The planner of before is trained, and knows nothing of what the expert learns now."""
+    model = make().learn(30)
+    obs = model.observation_space.sample()
+    obs["delay"][:] = 2
+    seen = []
+
+    class Saving(BaseCallback):
+        def _on_step(self):
+            if not seen:
+                model.save(tmp_path / "best_model.zip")
+                seen.append(model.predict(obs, deterministic=True)[0])
+            return True
+
+    model.learn(20, callback=Saving(), reset_num_timesteps=False)
+    loaded = SAID.load(tmp_path / "best_model.zip", device="cpu")
+    assert loaded.policy.who_answers == "expert" and model.policy.who_answers == "planner"
+    np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], seen[0])

@@ -1,5 +1,7 @@
 """SAID from logs: no environment, values of its own, and the same files, callbacks and resumes as online."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch as th
@@ -8,7 +10,8 @@ from small_task import delayed
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_said import SAID
+from sb3_said import SAID, PlannerConfig
+from sb3_said.files.archive import SavedFileError
 from sb3_said.offline import Dataset
 from sb3_said.said.training import PlannerTraining
 
@@ -72,6 +75,32 @@ def test_candidates_are_scored_by_v_alone(learned, monkeypatch):
         learned.policy.values.v[-1].weight.neg_()
     assert not np.array_equal(before, flipped)
     np.testing.assert_array_equal(answer(learned, obs), before)
+
+
+def test_v_chooses_where_the_settings_are_the_defaults():
+    """They score the decision at a present that all candidates share, where no action shows in V."""
+    model = learn(make(planner_kwargs={"scored_states": PlannerConfig().scored_states}))
+    assert model.policy.planner.config.scored_states == "future"
+    obs = {key: th.as_tensor(value) for key, value in observe().items()}
+    assert (model.policy._plan(obs).values.std(1) > 0).all()
+    with pytest.raises(ValueError, match="use 'future' or 'all'"):
+        model.set_planner(scored_states="decision")
+
+
+def test_a_log_that_cannot_be_read_leaves_a_trained_agent_as_it_was(tmp_path):
+    model = make().learn(60)
+    before, obs = weights(model), observe()
+    with pytest.raises(ValueError):
+        model.learn_offline(replace(log(), rewards=np.full(72, np.nan, np.float32)), 3)
+    assert (model.value, model.planner_newest_fraction, model.policy.values) == ("critics", 1.0, None)
+    th.testing.assert_close(weights(model), before, rtol=0, atol=0)
+    assert np.isfinite(answer(model, obs)).all()
+
+
+def test_other_logs_are_not_gone_on_with(tmp_path):
+    learn(steps=4, folder=tmp_path, save_interval=2)
+    with pytest.raises(SavedFileError, match="other data; give the same logs, or another folder"):
+        make().learn_offline(log(seed=1), 4, folder=tmp_path, save_interval=2)
 
 
 def test_v_is_learned_online_too_and_before_it_the_critics_bootstrap():

@@ -16,6 +16,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_said import SAID, DelayedObservationWrapper
+from sb3_said.delays import UniformDelay
 from sb3_said.said import trial
 
 
@@ -98,10 +99,30 @@ def test_episodes_of_several_environments_are_the_same_ones_whoever_ends_first()
     env = DummyVecEnv([lambda: make_env(9), lambda: make_env(4)])
     model = make(env=env, planner_ways={"b": {"sampling_steps": 1}}).learn(80)
     found = trial.play_trial(model, n_episodes=7)
-    assert found.n_steps == 3 * (3 * 9 + 4 * 4)
+    assert found.n_steps == 3 * 2 * 3 * 9  # the second environment goes on while the first plays its last episode
     for returns in found.returns.values():
         np.testing.assert_array_equal(returns, [9, 9, 9, 4, 4, 4, 4])
     assert set(found.ages) <= {0, 1, 2} and len(set(found.ages)) > 1
+
+
+def test_ages_that_change_within_an_episode_tell_nothing_of_it():
+    """The planner and the expert then meet other ages in what is the same episode by name."""
+    model = make(env=pendulum(delay=UniformDelay(0, 2))).learn(60)
+    np.testing.assert_array_equal(trial.play_trial(model, n_episodes=4).ages, np.zeros(4))
+
+
+def test_a_trial_can_be_stopped_and_the_planner_stays_trained():
+    model, asked = make(env=pendulum(), planner_ways={}).learn(60), []
+    own = model.policy.planner.config
+
+    def should_stop():
+        asked.append(model.policy.who_answers)
+        return len(asked) > 5 + 20  # after the five updates, amid the trial's second episode
+
+    with pytest.raises(KeyboardInterrupt):
+        model.train_planner(5, trial_episodes=9, should_stop=should_stop)
+    assert len(asked) == 26 and asked[-1] == "planner" == model.policy.who_answers
+    assert model.policy.planner.config == own
 
 
 @given(st.lists(st.tuples(*[st.integers(-50, 50)] * 2, st.integers(0, 6)), min_size=1, max_size=8))
@@ -114,13 +135,14 @@ def test_the_best_share_is_that_of_all(rows):
     assert np.isinf(up_to) == (expert.mean() > max(every[: int(ages.max()) + 1]) + 1e-12)
 
 
-def test_both_answer_only_where_that_is_surely_better():
+def test_both_answer_only_where_that_gains_more_than_its_error():
     """The paired differences' mean has to exceed their standard error."""
     base = np.array([10.0, -7.0, 3.0, 3.0])
     gain = np.array([0.0, 2.0, 0.0, 2.0])  # standard deviation sqrt(4 / 3), of the mean half of it: 0.577
-    assert trial.is_surely_better(base + gain - 0.4, base) and not trial.is_surely_better(base + gain - 0.45, base)
-    assert not trial.is_surely_better(base, base)
-    assert not trial.is_surely_better(np.array([2.0]), np.array([1.0]))  # one episode tells nothing of its chance
+    gains = trial.gains_more_than_its_error
+    assert gains(base + gain - 0.4, base) and not gains(base + gain - 0.45, base)
+    assert not gains(base, base)
+    assert not gains(np.array([2.0]), np.array([1.0]))  # one episode tells nothing of its chance
 
 
 def test_a_share_by_chance_is_none(monkeypatch):
