@@ -28,6 +28,8 @@ from std_msgs.msg import Float64MultiArray, String
 from sb3_said import SAID
 from sb3_said.realtime import ControlLoop, ModelProcess
 
+EVERY_SECOND = {"throttle_duration_sec": 1.0}  # at most, of a message
+
 
 class ControlNode(Node):
     """Feeds a control loop from one topic, and publishes its actions to another."""
@@ -57,14 +59,19 @@ class ControlNode(Node):
 
     def observe(self, message: JointState) -> None:
         """Tell the loop when the message was captured, on the loop's clock. A frozen sensor keeps its stamp."""
-        stamp = Time.from_msg(message.header.stamp).nanoseconds
+        stamp, log = Time.from_msg(message.header.stamp).nanoseconds, self.get_logger()
+        if stamp == 0:
+            log.error("Observation dropped: it has no stamp; set header.stamp where it is captured", **EVERY_SECOND)
+            return
         if stamp != self.stamp:
             age = 1e-9 * (self.get_clock().now().nanoseconds - stamp)
-            self.stamp, self.captured = stamp, time.monotonic() - age
+            if age < 0:
+                log.warning(f"Observation of the age {age:.6f} s, taken as 0: synchronise the clocks", **EVERY_SECOND)
+            self.stamp, self.captured = stamp, time.monotonic() - max(age, 0.0)
         try:
             self.loop.observe([*message.position, *message.velocity], self.captured)
         except ValueError as error:
-            self.get_logger().error(f"Observation dropped: {error}")
+            log.error(f"Observation dropped: {error}", **EVERY_SECOND)
 
     def act(self) -> None:
         if self.stamp is not None:  # until the robot speaks, nothing is sent

@@ -1,8 +1,7 @@
 """A robot on a serial port: python serial_robot.py agent.zip /dev/ttyACM0 0.02
 
 The robot sends lines "N x1 x2 ...": the number of the command that it executed last, and its state. It gets lines
-"N a1 a2 ...", executes the newest at its next control step, and starts counting from 0 when the port is opened.
-"""
+"N a1 a2 ...", executes the newest at its next control step, and starts counting from 0 when the port is opened."""
 
 import sys
 import threading
@@ -15,17 +14,18 @@ from sb3_said.realtime import ControlLoop, ModelProcess, ticks
 
 
 def listen(port, loop):
-    for line in iter(port.readline, b""):  # readline returns nothing once the port is closed, or silent for a second
+    while port.is_open:
         try:
-            number, *state = line.split()
-            loop.observe([float(x) for x in state], n_executed=int(number))
-        except ValueError as error:  # half a line, or a sensor that fails
-            print(f"Dropped {line!r}: {error}", file=sys.stderr)
+            if line := port.readline():  # nothing where the robot is silent for a second
+                number, *state = line.split()
+                loop.observe([float(x) for x in state], n_executed=int(number))
+        except (ValueError, TypeError) as error:  # half a line, a sensor that fails, or the port is being closed
+            print(f"Nothing observed: {error}", file=sys.stderr)
 
 
 def main(agent, device, period):
     with ModelProcess(partial(SAID.load, agent, device="cpu")) as model, ControlLoop(model, period) as loop:
-        with serial.Serial(device, 115200, timeout=1) as port:
+        with serial.Serial(device, 115200, timeout=1, write_timeout=1) as port:
             threading.Thread(target=listen, args=(port, loop), daemon=True).start()
             try:
                 for now in ticks(period):

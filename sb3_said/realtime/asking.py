@@ -26,7 +26,10 @@ class Asking:
     def answer(self, request: Request) -> tuple[np.ndarray, float]:
         """Return the actions from the request's target on, (K, act_dim), and the seconds that the model took.
 
-        Actions are in the units of the action space. K is 1 for a model without ``predict_plan``.
+        Actions are in the units of the action space, clipped to its bounds. K is 1 for a model without
+        ``predict_plan``.
+
+        :raises ValueError: for an answer that is not finite, or of another shape
         """
         began = time.perf_counter()
         observation: Any = request.observation[None]
@@ -41,7 +44,13 @@ class Asking:
                 observation["state_history"] = np.zeros((*shape, *request.observation.shape), np.float32)
                 observation["state_known"] = np.zeros(shape, np.float32)
         observation = observation if self.normalize is None else self.normalize(observation)
-        return plan_of(self.model, observation, self.deterministic)[0], time.perf_counter() - began
+        actions, space = plan_of(self.model, observation, self.deterministic)[0], self.model.action_space
+        seconds = time.perf_counter() - began
+        if actions.ndim != 2 or actions.shape[1:] != space.shape or len(actions) == 0 or not np.isfinite(actions).all():
+            raise ValueError(
+                f"It answers {actions} of the shape {actions.shape}, expected (K, {space.shape[0]}) and finite."
+            )
+        return np.clip(actions, space.low, space.high).astype(space.dtype), seconds
 
     def warm_up(self) -> float:
         """Run dummy answers until one takes no longer than later ones, and return the seconds that it took."""

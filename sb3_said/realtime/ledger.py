@@ -15,6 +15,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_said.delays.space import scale_action
+from sb3_said.realtime.statistics import LARGEST_COUNTED
 
 
 class NoAnswer(RuntimeError):
@@ -72,10 +73,10 @@ class Ledger:
         self.max_delay, self.max_age, self.action_delay = max_delay, max_age, action_delay
         self.hold_steps, self.safe_action = hold_steps, safe_action
         self.episode = -1
-        self.start_episode(-math.inf)
+        self.start_episode(math.nan)
 
     def start_episode(self, began: float) -> None:
-        """Forget all; observations captured before ``began`` are of another episode."""
+        """Forget all; observations captured before ``began``, NaN if unknown, are of another episode."""
         self.episode += 1
         self.n_sent = self.n_missing = 0
         self.is_answered = False
@@ -84,20 +85,23 @@ class Ledger:
         self._last = self.safe_action
         self._planned: dict[int, np.ndarray] = {}
         self._history = np.zeros((self.max_delay, *self.safe_action.shape), np.float32)
-        self._effects: deque[float] = deque(maxlen=self.max_delay + 1)  # when the newest actions took effect
+        self._effects: deque[float] = deque(maxlen=LARGEST_COUNTED)  # when the newest actions took effect
 
     @property
     def age(self) -> int:
         """How many of the newest actions do not show in the newest observation."""
         return self.n_sent - self._n_shown
 
-    def observe(self, observation: Any, capture_time: float | None, n_executed: int | None) -> bool:
+    def observe(
+        self, observation: Any, capture_time: float | None, n_executed: int | None, latest: float = math.inf
+    ) -> bool:
         """Take an observation, and tell whether it is younger than the one at hand.
 
         :param observation: (obs_dim,)
         :param capture_time: when it was captured; None if unknown
         :param n_executed: how many actions were executed before it was captured; by default those that took effect
             before ``capture_time``
+        :param latest: time of the latest capture that can be; NaN if unknown
         :raises ValueError: for what is no state, or for more actions than were sent
         """
         state = np.array(observation, np.float32)
@@ -108,21 +112,24 @@ class Ledger:
             )
         if capture_time is not None and not math.isfinite(capture_time):
             raise ValueError(f"capture_time is {capture_time}, expected a time; leave it out if it is not known.")
-        if n_executed is not None and not 0 <= n_executed <= self.n_sent:
+        if capture_time is not None:
+            is_repeated = capture_time == self.captured and self.observation is not None
+            if is_repeated or capture_time < self.captured or capture_time > latest:
+                return False
+        if n_executed is None:
+            later = takewhile(lambda effect: effect >= capture_time, reversed(self._effects))  # type: ignore[operator]
+            n_executed = self.n_sent - sum(1 for _ in later)
+        elif not 0 <= n_executed <= self.n_sent:
             raise ValueError(
                 f"The observation says that {n_executed} actions were executed, but {self.n_sent} were sent since "
                 "reset(); reset the robot's count, too, and drop observations of the episode before."
             )
-        if n_executed is None:  # counted in the newest D + 1; an older observation is out of reach anyhow
-            later = takewhile(lambda effect: effect >= capture_time, reversed(self._effects))  # type: ignore[operator]
-            n_executed = self.n_sent - sum(1 for _ in later)
-        is_first = self.observation is None
         if capture_time is not None:
-            if capture_time < self.captured or (capture_time == self.captured and not is_first):
-                return False
             self.captured = capture_time
         elif n_executed < self._n_shown:
             return False
+        elif n_executed == self._n_shown < self.n_sent and np.array_equal(state, self.observation):  # type: ignore[arg-type]
+            return False  # a frozen sensor; a robot that has executed all may as well stand still
         self.observation, self._n_shown = state, n_executed
         return True
 

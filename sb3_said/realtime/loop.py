@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+import warnings
 from collections import Counter, deque
 from collections.abc import Callable
 from typing import Any
@@ -18,8 +19,8 @@ from sb3_said.realtime.statistics import LoopStatistics, percentile
 
 #: Newest answers that tell how many steps the next one will take, and the share of them that this covers.
 ANSWERS_REMEMBERED, ANSWERS_COVERED = 100, 0.95
-#: A stamp this many periods ahead of ``now`` was read from another clock.
-FAR_AHEAD = 1000
+#: A stamp more periods ahead of now than the first is refused; further away than the second, it is of another clock.
+AHEAD, FAR = 2, 100
 
 
 class ControlLoop:
@@ -40,7 +41,7 @@ class ControlLoop:
     Python, give the model a process of its own: :class:`~sb3_said.realtime.ModelProcess`.
 
     :param model: anything with ``predict``, ``observation_space`` and ``action_space`` of Stable-Baselines3
-    :param period: of ``act``, in the unit of ``now``: seconds by default
+    :param period: of ``act``, in seconds; with ``simulate`` in the unit of ``now``
     :param answer_steps: n, steps that an answer will take; by default what 95 % of the newest 100 took
     :param action_delay: from ``act`` to the moment that the action takes effect, in the unit of ``now``
     :param max_age: largest age of an observation to act on, in steps; the model's largest delay by default
@@ -107,9 +108,12 @@ class ControlLoop:
         max_age = max_delay if max_age is None else max_age
         self._ledger = Ledger(state_space, space, max_delay, max_age, action_delay, hold, safe)
         self._statistics = LoopStatistics()
-        self._acted = math.nan  # when
-        self._is_due = self._has_heard = self._is_closing = False  # to ask; an observation since the last act
-        self._is_busy, self._stands = simulate is None, False  # and the next answer is waited for
+        self._acted = self._offset = math.nan  # when, and how far that clock is ahead of the monotonic one
+        self._is_closing = self._has_heard = self._has_warned = False  # an observation since the last act
+        self._is_busy, self._n_answers = True, 0  # a simulation's worker is never idle
+        self._is_due = False  # to ask a busy worker when it has answered
+        self._asked: Request | None = None  # what an idle one is asked
+        self._stands = False  # until the answer that is waited for
         self._error: BaseException | None = None
         self._in_flight: tuple[Request, np.ndarray, int] | None = None  # of a simulation, and when it arrives
         if simulate is not None:
@@ -143,18 +147,23 @@ class ControlLoop:
     def reset(self, now: float | None = None) -> None:
         """Begin an episode: nothing has been sent, seen or planned.
 
-        :param now: observations captured before are of another episode, and are dropped; by default none is
+        :param now: observations captured before are of another episode, and are dropped. ``time.monotonic()`` by
+            default; in a simulation none is dropped by default
+        :raises ValueError: for what is no time
         """
+        began = math.nan if now is None and self._simulate is not None else _time(now)
         with self._changed:
-            self._ledger.start_episode(-math.inf if now is None else now)
-            self._is_due = self._has_heard = self._stands = False
-            self._in_flight, self._acted = None, math.nan
+            self._ledger.start_episode(began)
+            self._is_due, self._has_heard, self._asked, self._in_flight = False, False, None, None
+            self._note(began)
+            self._changed.notify_all()
 
     def observe(self, observation: Any, capture_time: float | None = None, n_executed: int | None = None) -> None:
         """Take an observation, from any thread; one that is no younger than the one at hand is dropped.
 
         Its age is the number of the newest actions that do not show in it: those that took effect at its capture or
-        later. Stamps and ``now`` must be of one clock.
+        later. Stamps and ``now`` must be of one clock. What is stamped more than two periods ahead of now is dropped,
+        too, since it would make all that follows look old. The first such stamp, or one far behind, is warned of.
 
         :param observation: (obs_dim,), in the units of the task; copied
         :param capture_time: when it was captured. The same stamp twice is a sensor that froze: its observation ages. By
@@ -166,11 +175,21 @@ class ControlLoop:
         if capture_time is None and n_executed is None:
             capture_time = time.monotonic()
         with self._changed:
-            if self._ledger.observe(observation, capture_time, n_executed):
-                self._has_heard = self._is_due = True
-                self._changed.notify_all()
+            now = time.monotonic() + self._offset
+            latest, oldest = now + AHEAD * self.period, now - FAR * self.period
+            if self._ledger.observe(observation, capture_time, n_executed, latest):
+                self._has_heard = True
+                self._ask()
             else:
                 self._statistics.stale_observations += 1
+            is_odd = capture_time is not None and (capture_time > latest or capture_time < oldest)
+            warn, self._has_warned = is_odd and not self._has_warned, is_odd or self._has_warned
+        if warn:
+            warnings.warn(
+                f"An observation was captured at {capture_time:.3f}, but now it is {now:.3f}: a sensor that froze, or "
+                "another clock than that of act(now) and reset(now). This is said once; stale_observations counts on.",
+                stacklevel=2,
+            )
 
     def act(self, now: float | None = None) -> np.ndarray:
         """Return the action to send now, and count it as sent.
@@ -179,16 +198,18 @@ class ControlLoop:
         :return: (act_dim,), in the units of the action space
         :raises NoAnswer: where no action has been planned for too long; nothing counts as sent
         :raises RuntimeError: where the model has failed, or the loop is closed
-        :raises ValueError: where stamps and ``now`` are of different clocks
+        :raises ValueError: for what is no time, or where stamps and the first ``now`` are of different clocks
         """
-        now = time.monotonic() if now is None else now
+        now = _time(now)
         with self._changed:
             self._check()
-            if self._ledger.captured - now > FAR_AHEAD * self.period:
-                raise ValueError(
-                    f"An observation was captured at {self._ledger.captured}, but now it is {now}; take both from one "
-                    "clock, and the period in its unit."
-                )
+            if (ahead := (self._ledger.captured - now) / self.period) > AHEAD:
+                if ahead > FAR and math.isnan(self._offset):
+                    raise ValueError(
+                        f"An observation was captured at {self._ledger.captured}, but now it is {now}; take both from "
+                        "one clock, and the period in its unit."
+                    )
+                self._ledger.captured = now  # the clock went back
             if self._simulate is not None:
                 self._pretend(self._simulate)
             step = self._ledger.next_step()
@@ -197,13 +218,13 @@ class ControlLoop:
             self._count(step.n_missing, now)
             self._ledger.send(step, now)
             if not self._has_heard:  # ask again: the same observation is a step older
-                self._is_due = True
-                self._changed.notify_all()
-            self._has_heard, self._stands, self._acted = False, False, now
+                self._ask()
+            self._has_heard = self._stands = False
+            self._note(now)
             return step.action.copy()
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Block until the model is idle, and tell whether it is.
+        """Block until the model has answered what has come so far, and tell whether it has.
 
         Before the first action of an episode the robot stands, so that no action is sent meanwhile: then the answer
         that this waits for begins with that one.
@@ -211,30 +232,52 @@ class ControlLoop:
         :param timeout: in seconds; None for no limit
         :raises RuntimeError: where the model has failed, or the loop is closed
         """
+        ends = None if timeout is None else time.monotonic() + timeout
         with self._changed:
-            idle = self._idle(timeout)
-            if idle and self._simulate is None and self.n_sent == 0 and not self._ledger.is_planned(0):
-                self._stands = self._is_due = True
-                self._changed.notify_all()
-                idle = self._idle(timeout)
-            return idle
+            is_answered = self._wait(ends)
+            if is_answered and self._simulate is None and self.n_sent == 0 and not self._ledger.is_planned(0):
+                self._stands = True
+                self._ask()
+                is_answered = self._wait(ends)
+                self._stands = False
+            return is_answered
 
-    def close(self) -> None:
-        """Stop the worker, once it has made the answer that it is making."""
+    def close(self, timeout: float | None = 5.0) -> None:
+        """Stop the worker, once it has made the answer that it is making.
+
+        :param timeout: seconds to wait for it; a model that hangs for longer is left alone, and ends with the program
+        """
         with self._changed:
             self._is_closing = True
             self._changed.notify_all()
         if self._simulate is None and self._worker is not threading.current_thread():
-            self._worker.join()
+            self._worker.join(timeout)
 
-    def _idle(self, timeout: float | None) -> bool:
+    def _wait(self, ends: float | None) -> bool:
+        enough = self._n_answers + 2  # the worker may never be idle; the second one it will have begun after this
+
         def is_over() -> bool:
-            has_stopped = self._is_closing or self._error is not None
-            return has_stopped or self._simulate is not None or not (self._is_busy or self._is_due)
+            has_stopped = self._is_closing or self._error is not None or self._simulate is not None
+            return has_stopped or self._n_answers >= enough or not (self._is_busy or self._asked)
 
-        idle = self._changed.wait_for(is_over, timeout)
+        is_answered = self._changed.wait_for(is_over, None if ends is None else ends - time.monotonic())
         self._check()
-        return idle
+        return is_answered
+
+    def _note(self, now: float) -> None:
+        self._acted = now
+        if self._simulate is None:  # else time goes on in act alone
+            self._offset = now - time.monotonic()
+
+    def _ask(self) -> None:
+        """Say what an idle worker is asked; a busy one will be asked when it has answered.
+
+        Not when it wakes: by then an action may have been sent, and the observation be a step too old.
+        """
+        self._is_due = self._is_busy
+        if not self._is_busy:
+            self._asked = self._next_request() or self._asked
+            self._changed.notify_all()
 
     def _next_request(self) -> Request | None:
         return self._ledger.request(self.answer_steps if self.count_latency and not self._stands else 0)
@@ -264,16 +307,18 @@ class ControlLoop:
             while True:
                 with self._changed:
                     self._is_busy = False
+                    if self._is_due:
+                        self._ask()
                     self._changed.notify_all()
-                    self._changed.wait_for(lambda: self._is_closing or self._is_due)
-                    if self._is_closing:
+                    self._changed.wait_for(lambda: self._is_closing or self._asked)
+                    request, self._asked = self._asked, None
+                    if self._is_closing or request is None:
                         return
-                    request, self._is_due, self._stands = self._next_request(), False, False
                     self._is_busy = True
-                if request is not None:
-                    actions, _ = self._asking.answer(request)
-                    with self._changed:
-                        self._take(request, actions)
+                actions, _ = self._asking.answer(request)
+                with self._changed:
+                    self._take(request, actions)
+                    self._n_answers += 1
         except BaseException as error:  # act raises it where the robot is
             with self._changed:
                 self._error, self._is_busy = error, False
@@ -297,21 +342,29 @@ class ControlLoop:
         ledger = self._ledger
         if request.episode != ledger.episode:
             return
-        took = ledger.n_sent - request.n_sent
-        self._statistics.count(answer_steps=took)
-        self._took.append(took)
-        self._expect()
+        if ledger.n_sent > 0:  # before, the robot stands, and no step goes by however long an answer takes
+            took = ledger.n_sent - request.n_sent
+            self._statistics.count(answer_steps=took)
+            self._took.append(took)
+            self._expect(int(percentile(Counter(self._took), ANSWERS_COVERED)))
         if self.count_latency:
             self._statistics.late_answers += ledger.splice(actions, request.target) > 0
         else:
             ledger.splice(actions[:1], ledger.n_sent)
 
-    def _expect(self) -> None:
+    def _expect(self, answer_steps: int) -> None:
         if not self._answer_steps_given:
-            self.answer_steps = int(percentile(Counter(self._took), ANSWERS_COVERED))
+            self.answer_steps = answer_steps
 
     def _warm_up(self) -> None:
         """Make the first answer take no longer than later ones, and expect it to take as long."""
         seconds = self._asking.warm_up()
-        self._took.append(math.ceil(seconds / self.period) if self._simulate is None else self._simulate(seconds))
-        self._expect()
+        self._expect(math.ceil(seconds / self.period) if self._simulate is None else self._simulate(seconds))
+
+
+def _time(now: float | None) -> float:
+    """Return ``now``, which is ``time.monotonic()`` by default."""
+    now = time.monotonic() if now is None else now
+    if not math.isfinite(now):
+        raise ValueError(f"now is {now}, expected a finite time.")
+    return now

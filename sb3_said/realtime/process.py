@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
+import threading
 from collections.abc import Callable
+from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -16,12 +18,16 @@ from sb3_said.realtime.asking import plan_of
 class ModelProcess:
     """Loads a model in another process and answers as it does, for a :class:`~sb3_said.realtime.ControlLoop`.
 
+    The process imports the script that makes it once more, so what the script does stands below
+    ``if __name__ == "__main__":``. Threads that ask at once are answered one after the other.
+
     :param load: makes the model; a function that another process can import, such as
         ``functools.partial(SAID.load, "agent.zip", device="cpu")``
     :raises RuntimeError: where the model cannot be loaded; the message holds the reason
 
-    >>> with ModelProcess(partial(SAID.load, "agent.zip")) as model, ControlLoop(model, 0.02) as loop:  # doctest: +SKIP
-    ...     ...
+    >>> if __name__ == "__main__":  # doctest: +SKIP
+    ...     with ModelProcess(partial(SAID.load, "agent.zip")) as model, ControlLoop(model, 0.02) as loop:
+    ...         ...
     """
 
     def __init__(self, load: Callable[[], Any]):
@@ -30,7 +36,10 @@ class ModelProcess:
         self._process = context.Process(target=_serve, args=(load, theirs), name="ModelProcess", daemon=True)
         self._process.start()
         theirs.close()
-        self.observation_space, self.action_space = self._receive()
+        self._lock = threading.Lock()  # an answer belongs to the question before it
+        self.observation_space, self.action_space = self._receive(
+            ' It ended as it began: does the script make its ModelProcess below `if __name__ == "__main__":`?'
+        )
 
     def __enter__(self) -> ModelProcess:
         return self
@@ -62,18 +71,21 @@ class ModelProcess:
             self._process.join()
 
     def _call(self, *question: Any) -> Any:
-        try:
-            self._pipe.send(question)
-        except OSError as error:
-            raise RuntimeError("The model's process has ended; make another one.") from error
-        return self._receive()
+        with self._lock:
+            try:
+                self._pipe.send(question)
+            except OSError as error:
+                raise RuntimeError("The model's process has ended; make another one.") from error
+            return self._receive()
 
-    def _receive(self) -> Any:
+    def _receive(self, hint: str = "") -> Any:
         try:
             answer, failure = self._pipe.recv()
         except (EOFError, OSError) as error:
             self._process.join(5)
-            raise RuntimeError(f"The model's process has ended with exit code {self._process.exitcode}.") from error
+            raise RuntimeError(
+                f"The model's process has ended with exit code {self._process.exitcode}.{hint}"
+            ) from error
         if failure is not None:
             raise RuntimeError(f"In the model's process: {failure}")
         return answer
@@ -88,17 +100,15 @@ def _serve(load: Callable[[], Any], pipe: Connection) -> None:
     except Exception as error:  # told to who asked
         pipe.send((None, f"{type(error).__name__}: {error}"))
         return
-    while True:
-        try:
+    with suppress(EOFError, OSError):
+        while True:
             kind, *arguments = pipe.recv()
-        except EOFError:
-            return
-        answer, failure = None, None
-        try:
-            if kind == "plan":
-                answer = plan_of(model, *arguments)
-            elif hasattr(model, "warmup"):
-                model.warmup()
-        except Exception as error:
-            failure = f"{type(error).__name__}: {error}"
-        pipe.send((answer, failure))
+            answer, failure = None, None
+            try:
+                if kind == "plan":
+                    answer = plan_of(model, *arguments)
+                elif hasattr(model, "warmup"):
+                    model.warmup()
+            except Exception as error:
+                failure = f"{type(error).__name__}: {error}"
+            pipe.send((answer, failure))

@@ -36,9 +36,10 @@ class LoopStatistics:
     ages: Counter[int] = field(default_factory=Counter)
     """of the newest observation when an action was sent, in control steps; 1,000 stands for all above, as below"""
     answer_steps: Counter[int] = field(default_factory=Counter)
-    """actions that were sent while an answer was made"""
+    """actions that were sent while an answer was made; of answers after an episode's first action"""
     gaps: Counter[float] = field(default_factory=Counter)
-    """from one action to the next, in periods, to a thousandth below 2 and to whole ones above"""
+    """from one action to the next, in periods, to a thousandth below 2 and to whole ones above; 0 where a clock went
+    back"""
     steps: int = 0
     """actions sent"""
     overruns: int = 0
@@ -52,7 +53,8 @@ class LoopStatistics:
     late_answers: int = 0
     """answers after the step that they were planned for; a plan's later actions serve"""
     stale_observations: int = 0
-    """observations that were no younger than the one at hand: repeated by a frozen sensor, or overtaken"""
+    """observations that were no younger than the one at hand (repeated by a frozen sensor, or overtaken), of another
+    episode, or stamped ahead of now"""
 
     def count(self, age: int | None = None, answer_steps: int | None = None, gap: float | None = None) -> None:
         """Count one of each that is given."""
@@ -61,6 +63,7 @@ class LoopStatistics:
         if answer_steps is not None:
             self.answer_steps[min(answer_steps, LARGEST_COUNTED)] += 1
         if gap is not None:
+            gap = max(gap, 0.0)
             self.gaps[round(gap, 3) if gap < 2 else float(round(min(gap, LARGEST_COUNTED)))] += 1
             self.overruns += gap > 1.5
 

@@ -58,7 +58,7 @@ def to_onnx(policy: SAIDPolicy) -> Any:
         steps_ago = constant(np.arange(max_delay, 0, -1))  # (D,)
         since = add("Cast", [add("LessOrEqual", [steps_ago, KEYS[2]])], to=TensorProto.FLOAT)  # (B, D)
         history = add("Mul", [KEYS[1], add("Unsqueeze", [since, constant([2], np.int64)])])
-        flat = add("Reshape", [history, constant([-1, max_delay * act_dim], np.int64)])
+        flat = add("Flatten", [history], axis=1)  # also where D is 0, of which a Reshape could not tell B
         age = add("Div", [KEYS[2], constant(max(max_delay, 1))])
         read = add("Concat", [KEYS[0], flat, age], axis=1)
     x = add("Div", [add("Sub", [read, constant(student.mean.cpu())]), constant(student.std.cpu())])

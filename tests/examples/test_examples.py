@@ -7,6 +7,7 @@ import os
 import queue
 import signal
 import sys
+import threading
 import time
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -88,7 +89,10 @@ class Node:
         return SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=time.time_ns()))
 
     def get_logger(self) -> Any:
-        return SimpleNamespace(error=self.logged.append, info=self.logged.append)
+        def log(text: str, throttle_duration_sec: float = 0.0) -> None:
+            self.logged.append(text)
+
+        return SimpleNamespace(error=log, warning=log, info=log)
 
     def destroy_node(self) -> None:
         self.is_destroyed = True
@@ -142,8 +146,20 @@ def test_the_ros_node_observes_acts_and_tells_that_it_lives(ros: Any) -> None:
             node.timers[0.5]()
     node.subscribed["/joints"](joint_state([np.nan], [0.25], time.time_ns()))
     assert "Observation dropped" in node.logged[0] and "finite" in node.logged[0]
+    node.subscribed["/joints"](joint_state([0.5], [0.25], time.time_ns() + 60_000_000_000))
+    assert "taken as 0" in node.logged[1] and node.captured <= time.monotonic() and node.loop._ledger.age == 0
+    node.subscribed["/joints"](joint_state([0.75], [0.25], 0))
+    assert "no stamp" in node.logged[2] and node.loop._ledger.observation[0] == 0.5
     node.timers[1.0]()
     assert "steps 3" in node.published["~/heartbeat"][0] and "stale 2" in node.published["~/heartbeat"][0]
+    node.stop()
+
+
+def test_the_ros_node_sends_nothing_to_a_robot_without_stamps(ros: Any) -> None:
+    node = ros.ControlNode()
+    node.subscribed["/joints"](joint_state([0.5], [0.25], 0))
+    node.timers[0.5]()
+    assert node.published["/arm"] == [] and "no stamp" in node.logged[0]
     node.stop()
 
 
@@ -179,10 +195,11 @@ class Port:
 
     opened: list[Port] = []
 
-    def __init__(self, device: str, baud: int, timeout: float):
-        self.device, self.commands = device, []
+    def __init__(self, device: str, baud: int, timeout: float, write_timeout: float):
+        assert min(timeout, write_timeout) > 0
+        self.device, self.commands, self.is_open = device, [], True
         self.lines: queue.Queue[bytes] = queue.Queue()
-        for line in (b"gar bage\n", b"0 1.0 0.5\n"):
+        for line in (b"", b"gar bage\n", b"", b"0 1.0 0.5\n"):  # silent for a while at first
             self.lines.put(line)
         self.opened.append(self)
 
@@ -190,6 +207,7 @@ class Port:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.is_open = False
         self.lines.put(b"")
 
     def readline(self) -> bytes:
@@ -212,7 +230,11 @@ def test_the_serial_robot(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
     assert port.device == "/dev/robot" and [number for number, _ in port.commands] == [*range(1, 21), 21]
     assert port.commands[-1] == (21, 0.0) and len({action for _, action in port.commands}) > 1
     shown = capsys.readouterr()
-    assert "steps 20" in shown.out and r"Dropped b'gar bage\n'" in shown.err
+    assert "steps 20" in shown.out and "b'bage'" in shown.err and "unpack" not in shown.err  # silence
+    listener = next((thread for thread in threading.enumerate() if "listen" in thread.name), None)
+    if listener is not None:
+        listener.join(30)
+        assert not listener.is_alive()
 
 
 class Interface:

@@ -59,7 +59,31 @@ def test_an_observation_from_before_the_episode_is_dropped():
     ledger.observe([1.0], 7, None)
     ledger.start_episode(10.0)
     assert ledger.observation is None and ledger.n_sent == 0
-    assert not ledger.observe([1.0], 9.9, None) and ledger.observe([1.0], 10.0, None)
+    assert not ledger.observe([1.0], 9.9, None)
+    assert not ledger.observe([1.0], 9.9, 60)  # its count is of that episode, too
+    assert ledger.observe([1.0], 10.0, None)
+
+
+def test_a_stamp_later_than_it_can_be_is_dropped_and_spoils_nothing():
+    ledger = make()
+    assert ledger.observe([1.0], 0, None) and not ledger.observe([2.0], 9, None, latest=2)
+    assert ledger.observation == 1.0 and ledger.observe([3.0], 2, None, latest=2)
+
+
+def test_a_sensor_that_freezes_is_known_without_stamps_by_number_and_state():
+    ledger = make()
+    assert ledger.observe([1.0], None, 0) and ledger.observe([1.0], None, 0)  # a robot that stands
+    send(ledger)
+    assert not ledger.observe([1.0], None, 0) and ledger.observe([1.1], None, 0) and ledger.observe([1.1], None, 1)
+
+
+@given(st.lists(st.floats(0, 2), min_size=1, max_size=60), st.integers(0, 4), st.floats(0, 60))
+def test_an_age_beyond_what_the_model_reads_is_counted_in_full(gaps, max_delay, stamp):
+    ledger, times = make(max_delay), np.cumsum(gaps)
+    for now in times:
+        send(ledger, 1, now)
+    ledger.observe([1.0], stamp, None)
+    assert ledger.age == (times >= stamp).sum()
 
 
 @pytest.mark.parametrize(

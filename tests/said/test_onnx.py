@@ -21,16 +21,16 @@ class Uneven(Drift):
     action_space = spaces.Box(np.float32([-2.0]), np.float32([0.5]))
 
 
-@pytest.mark.parametrize("task", ["delayed", "plain"])
-def test_it_answers_as_the_agent(task, tmp_path):
-    env = delayed() if task == "delayed" else Uneven()
+@pytest.mark.parametrize("max_delay", [2, 0, None])
+def test_it_answers_as_the_agent(max_delay, tmp_path):
+    env = Uneven() if max_delay is None else delayed(max_delay)
     model = make(env)
     set_random_seed(0)
     model.policy.make_student(16)
     student = model.policy.student
     rng = np.random.default_rng(0)
-    obs = observe(env=env) if task == "delayed" else rng.normal(size=(7, 2)).astype(np.float32)
-    if task == "delayed":  # what is older than an observation is not to be read
+    obs = rng.normal(size=(7, 2)).astype(np.float32) if max_delay is None else observe(env=env)
+    if max_delay:  # what is older than an observation is not to be read
         obs["delay"][:, 0], obs["action_history"] = np.arange(7) % 3, rng.uniform(-1, 1, (7, 2, 1)).astype(np.float32)
         assert (obs["action_history"][obs["delay"][:, 0] == 0] != 0).all()
     student.fit(student.read(model.policy.obs_to_tensor(obs)[0]))
