@@ -8,7 +8,7 @@ a SAID run its expert's evaluations are read. A training that has not ended coun
 
 mean        of all evaluations in the last steps, over runs
 sd / mean   standard deviation between the evaluations of one run, over their mean; the worst run's
-bad         evaluations below 70 % of their run's median
+bad         evaluations below 70 % of their run's median (further below it than 30 % of its size)
 worst run   its mean over the mean of all runs
 """
 
@@ -53,8 +53,8 @@ def steadiness(runs: list[dict[str, Any]], last: int) -> dict[str, Any]:
         "runs": len(runs),
         "steps": [run["steps"][-1] for run in runs],
         "mean": float(of_runs.mean()),
-        "sd / mean": max(float(late.std() / late.mean()) for late in means),
-        "bad": sum(int((late < BAD * np.median(late)).sum()) for late in means),
+        "sd / mean": max(float(late.std() / abs(late.mean())) for late in means),
+        "bad": sum(int((late < np.median(late) - (1 - BAD) * abs(np.median(late))).sum()) for late in means),
         "evaluations": sum(map(len, means)),
         "worst run": float(of_runs.min() / of_runs.mean()),
     }

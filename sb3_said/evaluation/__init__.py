@@ -1,7 +1,15 @@
 """How good and how fast an agent is: whole seeded episodes, intervals, decision latencies, plots."""
 
 from sb3_said.evaluation.rollout import Rollout, collect_observations, measure_latency, rollout
-from sb3_said.evaluation.statistics import Interval, Latency, Summary, confidence_interval, iqm, worst_tenth
+from sb3_said.evaluation.statistics import (
+    Interval,
+    Latency,
+    Summary,
+    confidence_interval,
+    iqm,
+    stratified_interval,
+    worst_tenth,
+)
 
 __all__ = [
     "Interval",
@@ -13,5 +21,6 @@ __all__ = [
     "iqm",
     "measure_latency",
     "rollout",
+    "stratified_interval",
     "worst_tenth",
 ]

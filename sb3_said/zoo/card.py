@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import shlex
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 import yaml
 from huggingface_hub import EvalResult, ModelCard, ModelCardData
 
+from sb3_said import SAID
 from sb3_said.delays.space import written_ages
 from sb3_said.zoo.arguments import explained, make_parser
 from sb3_said.zoo.cells import Cell, Results, average
@@ -52,19 +54,32 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("-o", "--output", type=Path, metavar="MD", help="the card (default: beside the agent, .md)")
     args = parser.parse_args(argv)
     with explained(parser):
-        card = make_card(load_run(args.agent), Record.read(args.run), Results(args.returns, None), args.latency)
+        record, results = Record.read(args.run), Results(args.returns, None)
+        card = make_card(load_run(args.agent), record, results, args.latency, trial_steps(args.run))
     target = args.output or args.agent.with_suffix(".md")
     card.save(target)
     print(f"Wrote {target}")
 
 
-def make_card(run: LoadedRun, record: Record, results: Results, latency_ms: float | None = None) -> ModelCard:
+def trial_steps(folder: Path) -> int:
+    """Return the environment steps that a run's trials took beyond those of ``learn``, as its log has them."""
+    file = folder / "progress.csv"
+    if not file.is_file():
+        return 0
+    with file.open(newline="") as rows:
+        return sum(int(float(row.get("trial/steps") or 0)) for row in csv.DictReader(rows))
+
+
+def make_card(
+    run: LoadedRun, record: Record, results: Results, latency_ms: float | None = None, n_trial_steps: int = 0
+) -> ModelCard:
     """Return the card of an agent.
 
     :param run: the agent's file
     :param record: of the run that made it
     :param results: of ``over-delays``, with cells of this file
     :param latency_ms: median time of a decision
+    :param n_trial_steps: environment steps that told how the planner decides, beyond those of the training
     :raises ValueError: when the results hold nothing of this file
     """
     file = Path(run.info["file"])
@@ -95,7 +110,7 @@ def make_card(run: LoadedRun, record: Record, results: Results, latency_ms: floa
         model_name=type(run.model).__name__,
         eval_results=[result],
     )
-    text = describe(run, record, results, cells, answered, latency_ms)
+    text = describe(run, record, results, cells, answered, latency_ms, n_trial_steps)
     title = f"{type(run.model).__name__} on {env_id} under observation delay"
     return ModelCard.from_template(data, template_str=TEMPLATE, title=title, text=text)
 
@@ -107,6 +122,7 @@ def describe(
     cells: list[Cell],
     answered: list[Cell],
     latency_ms: float | None,
+    n_trial_steps: int,
 ) -> str:
     """Return the card's text: how to use it, how it was made, and what it returned."""
     file = Path(run.info["file"])
@@ -117,10 +133,12 @@ def describe(
         "ages trained on": written_ages(run.model.trained_ages or []) + " control steps",  # type: ignore[attr-defined]
         "largest age it reads": f"{longest_delay(run.model) or 0} control steps",
         "control period": "unknown" if period is None else f"{1000 * period:g} ms",
-        "who answers": answered[0].answer or kind,
-        "environment steps": f"{run.model.num_timesteps:,}",
+        "who answers": who_answers(run.model),
+        "environment steps": f"{run.model.num_timesteps:,}"
+        + (f", and {n_trial_steps:,} to choose how it decides" if n_trial_steps else ""),
         "training seed": record.seed,
-        "made by": f"`{made_by(record)}`",
+        "made by": f"`{made_by(record, run.model)}`",
+        "SHA-256": f"`{digest_of(run)}`",
         "median decision": "not measured" if latency_ms is None else f"{latency_ms:g} ms, one CPU thread",
     }
     lines = [
@@ -153,16 +171,36 @@ def describe(
     return "\n".join(lines)
 
 
-def made_by(record: Record) -> str:
-    """Return the command that trains such an agent, with the settings that are not the preset's."""
+def who_answers(model: Any) -> str:
+    """Say who answers in an agent, up to which age, and in which way its planner decides."""
+    if not isinstance(model, SAID):
+        return type(model).__name__
+    who, config = model.policy.who_answers, model.policy.planner.config
+    told = f"both, the expert up to age {model.policy.expert_up_to}" if who == "both" else who
+    if who not in ("planner", "both"):
+        return told
+    how = f"{config.sampling_steps} denoising steps at temperature {config.temperature:g}"
+    return f"{told}; the planner in {how}" + (f", {config.n_candidates} candidates" if config.temperature else "")
+
+
+def made_by(record: Record, model: Any = None) -> str:
+    """Return the command that trains such an agent, with the settings that are not the preset's.
+
+    :param model: the agent, which has the settings that the preset got since
+    """
     steps = record.options.get("n_timesteps")
     budget = ["-n", str(steps)] if steps and steps > 0 else []  # rl_zoo3's -1 leaves it to the YAML
     file = config_file(record.algo, bool(record.dataset))
     blocks = yaml.safe_load(file.read_text())
     usual = blocks.get(record.env, blocks["default"])
     usual |= preset_overrides(file, record.preset, record.env, record.delay, dataset=record.dataset)
-    own = {name: value for name, value in record.hyperparams.items() if value != usual.get(name)}
-    own.pop("n_timesteps", None)
-    params = ["-params", *(f"{name}:{value!r}" for name, value in own.items())] if own else []
+    newer = usual.keys() - record.hyperparams.keys() - {"policy", "planner_kwargs"}
+    had = {name: getattr(model, name) for name in sorted(newer) if hasattr(model, name)} | record.hyperparams
+    own = {name: value for name, value in had.items() if value != usual.get(name) and name != "n_timesteps"}
     words = ["sb3-said", "train", "--algo", record.algo, *record.task_words(), "--preset", record.preset, *budget]
-    return shlex.join([*words, "--seed", str(record.seed), *params])
+    if trained := record.options.get("trained_agent"):
+        words += ["-i", trained]
+    words += ["--seed", str(record.seed)]
+    for option, settings in (("-params", own), ("--env-kwargs", record.env_kwargs)):
+        words += [option, *(f"{name}:{value!r}" for name, value in settings.items())] if settings else []
+    return shlex.join(words)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sb3_said.delays.text import make_process
-from sb3_said.evaluation import confidence_interval, worst_tenth
+from sb3_said.evaluation import Interval, confidence_interval, stratified_interval, worst_tenth
 from sb3_said.files.atomic import write_json
 
 AGE = ", age "  # in the name of a column, before the error
@@ -44,7 +44,8 @@ class Cell:
 
     @property
     def key(self) -> tuple[str, ...]:
-        """The file's contents, the answer, the delay and the error: equal keys have equal results."""
+        """The file's contents, the answer, the delay and the error: equal keys have equal results, but for rounding,
+        which depends on how many episodes are played side by side."""
         return self.sha256, str(self.answer), repr(make_process(self.delay)), str(self.age_error)
 
     @property
@@ -133,7 +134,15 @@ def print_table(table: Table, delays: list[int | str]) -> None:
     columns: dict[str, list[int | str]] = {str(delay): [delay] for delay in delays}
     for name, kind in (("mean of fixed", int), ("mean of random", str)):
         columns[name] = [delay for delay in delays if isinstance(delay, kind) and AGE not in str(delay)]
-    averages = {agent: [average(row, column) for column in columns.values()] for agent, row in table.items()}
+    _print_rows(table, columns, confidence_interval)
+    several = {agent: row for agent, row in table.items() if row and all(x.ndim == 2 for x in row.values())}
+    if several:
+        print("\nThe same agents, with episodes drawn within training seeds:")
+        _print_rows(several, columns, stratified_interval)
+
+
+def _print_rows(table: Table, columns: dict[str, list[int | str]], interval: Callable[[Any], Interval]) -> None:
+    averages = {agent: [average(row, column, interval) for column in columns.values()] for agent, row in table.items()}
     rows = [["return under delay", *columns]]
     rows += [[agent, *(text for text, _ in row)] for agent, row in averages.items()]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -144,12 +153,17 @@ def print_table(table: Table, delays: list[int | str]) -> None:
     print(f"95 % intervals over {', or '.join(units)}")
 
 
-def average(row: Mapping[int | str, np.ndarray], delays: list[int | str]) -> tuple[str, str]:
+def average(
+    row: Mapping[int | str, np.ndarray],
+    delays: list[int | str],
+    interval: Callable[[Any], Interval] = confidence_interval,
+) -> tuple[str, str]:
     """Write the mean return over delays with its interval, and what that is over: training seeds, or reset seeds.
 
     :param row: of an agent
     :param delays: those that the agent cannot play are left out, and the rest is counted. Delays of different numbers
         of training seeds have a mean and no interval
+    :param interval: of returns (n_episodes,), or (n_seeds, n_episodes) of several training seeds
     """
     returns = [row[delay] for delay in delays if delay in row]
     if not returns:
@@ -157,6 +171,6 @@ def average(row: Mapping[int | str, np.ndarray], delays: list[int | str]) -> tup
     covered = "" if len(returns) == len(delays) else f", {len(returns)} of {len(delays)}"
     if len({one.shape for one in returns}) > 1:
         return f"{np.mean([one.mean() for one in returns]):.1f}{covered}", ""
-    interval = confidence_interval(np.mean(returns, axis=0))  # from (delays, n_episodes) or (delays, seeds, n_episodes)
-    units = "episodes" if returns[0].ndim == 1 else "training seeds"
-    return f"{interval}{covered}", f"{interval.n} {units} ({interval.method})"
+    found = interval(np.mean(returns, axis=0))  # from (delays, n_episodes) or (delays, seeds, n_episodes)
+    units = "training seeds" if returns[0].ndim == 2 and interval is confidence_interval else "episodes"
+    return f"{found}{covered}", f"{found.n} {units} ({found.method})"

@@ -104,14 +104,18 @@ class Video:
 
 
 class SideBySide(Video):
-    """A video of two plays of the same starts, the first on the left; the one that ends first stays there, darker."""
+    """A video of pairs of plays of one start, the first on the left; the one that ends first stays there, darker."""
 
     def __init__(self, path: Path, fps: int):
         super().__init__(path, fps)
         self._plays: list[list[np.ndarray]] = []
 
+        self._n_written = 0
+
     def begin(self) -> None:
         """Say that the next steps are of the next play."""
+        if len(self._plays) == 2:
+            self._write()
         self._plays.append([])
         self.frames = self._steps = 0
 
@@ -119,12 +123,18 @@ class SideBySide(Video):
         self._plays[-1].append(frame)
         self.frames += 1
 
-    def close(self) -> None:
+    def _write(self) -> None:
+        """Write the pair that is held."""
         length = max((len(frames) for frames in self._plays), default=0)
         padded = [frames + [frames[-1] // 2] * (length - len(frames)) for frames in self._plays if frames]
-        self.frames = 0
         for pair in zip(*padded, strict=True):
             super().append(np.concatenate(pair, axis=1))
+        self._n_written += length
+        self._plays = []
+
+    def close(self) -> None:
+        self._write()
+        self.frames = self._n_written
         super().close()
 
 
@@ -182,27 +192,34 @@ def main(argv: list[str] | None = None) -> None:
             drawn |= {"width": args.size, "height": args.size}
         played = args.algo, args.env, read_delay(args.delay), args.device, drawn, args.gym_packages
         run = load_run(args.run, *played)
+        if args.beside_ignorant and not longest_delay(run.model):
+            raise ValueError(f"--beside-ignorant needs an agent that is told an age; {args.run} knows no delay.")
         with answering(run.model, args.answer), closing(video) if video else nullcontext():
-            if isinstance(video, SideBySide):
-                video.begin()
-                show(run, args, video, age_error=-(longest_delay(run.model) or 0))
-                video.begin()
-            show(run, args, video)
+            if not isinstance(video, SideBySide):
+                show(run, args, video, args.seed, args.episodes)
+            else:
+                for seed in range(args.seed, args.seed + args.episodes):
+                    for age_error in (-(longest_delay(run.model) or 0), 0):
+                        video.begin()
+                        show(run, args, video, seed, 1, age_error)
     if video:
         print(f"Wrote {args.record}: {video.frames} frames at {video.fps:g} a second")
 
 
-def show(run: LoadedRun, args: argparse.Namespace, video: Video | None, age_error: int = 0) -> None:
-    """Play the episodes and print how each ended.
+def show(
+    run: LoadedRun, args: argparse.Namespace, video: Video | None, seed: int, n_episodes: int, age_error: int = 0
+) -> None:
+    """Play episodes and print how each ended.
 
+    :param seed: of the first one's reset
     :param age_error: control steps that the age is told wrong by
     """
     told = ", told that every observation is new" if age_error else ""
     run.play(
-        args.episodes,
-        args.seed,
+        n_episodes,
+        seed,
         age_error=age_error,
         deterministic=not args.stochastic,
         on_step=video.on_step if video else None,
-        on_episode=lambda i, ret, n: print(f"seed {args.seed + i}{told}: return {ret:,.1f} in {n} steps"),
+        on_episode=lambda i, ret, n: print(f"seed {seed + i}{told}: return {ret:,.1f} in {n} steps"),
     )

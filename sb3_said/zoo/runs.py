@@ -54,7 +54,10 @@ class LoadedRun:
         """Play whole episodes, see :func:`~sb3_said.evaluation.rollout`.
 
         :param age_error: control steps that the age is told wrong by, within what the agent was built for
+        :raises ValueError: for an ``age_error`` where the agent is told no age
         """
+        if age_error and longest_delay(self.model) is None:
+            raise ValueError(f"This {type(self.model).__name__} reads no age, so none can be told wrong.")
 
         def read(observation: Observation) -> Observation:
             if age_error:

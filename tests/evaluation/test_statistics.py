@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import ttest_1samp
 
-from sb3_said.evaluation import Latency, Summary, confidence_interval, iqm, worst_tenth
+from sb3_said.evaluation import Latency, Summary, confidence_interval, iqm, stratified_interval, worst_tenth
 
 
 @pytest.mark.parametrize("statistic", [np.mean, np.median, iqm])
@@ -170,3 +170,23 @@ def test_the_worst_tenth() -> None:
     assert worst_tenth([5.0]) == 5.0
     assert worst_tenth(np.arange(20.0)[::-1]) == 0.5
     assert worst_tenth(np.arange(22.0).reshape(2, 11)) == 1.0
+
+
+def test_a_stratified_interval_has_the_spread_of_seeds_and_of_their_episodes() -> None:
+    """The mean's variance, of S seeds drawn and E episodes of each: between / S + within / (S E)."""
+    rng = np.random.default_rng(0)
+    for spread, n_seeds, n_episodes in ((0.0, 4, 20), (30.0, 4, 20), (30.0, 9, 5)):
+        returns = rng.normal(100, 10, (n_seeds, n_episodes)) + spread * rng.normal(size=(n_seeds, 1))
+        between, within = returns.mean(1).var(), returns.var(1).mean()
+        expected = 1.96 * np.sqrt(between / n_seeds + within / (n_seeds * n_episodes))
+        found = stratified_interval(returns)
+        assert found.value == pytest.approx(returns.mean()) and found.n == n_seeds * n_episodes
+        assert (found.high - found.low) / 2 == pytest.approx(expected, rel=0.08)
+    only = stratified_interval(np.full((3, 2), 7.0))
+    assert (only.low, only.value, only.high) == (7.0, 7.0, 7.0)
+
+
+@pytest.mark.parametrize("returns", [[1.0, 2.0], [[]], [[np.nan, 1.0]]])
+def test_a_stratified_interval_needs_seeds_and_their_episodes(returns: Any) -> None:
+    with pytest.raises(ValueError, match="shape"):
+        stratified_interval(returns)

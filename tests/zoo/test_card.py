@@ -1,8 +1,10 @@
 """sb3-said card: what stands in it is what was measured of that very file."""
 
+import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -44,6 +46,8 @@ def test_an_agent_handed_on_and_its_card(run: Path, tmp_path: Path, capsys: pyte
     assert f"`sb3-said train --algo said --env {ENV}" in text and "| under delay | planner | expert |" in text
     assert f"| 0 | {np.mean(right[0]):.1f} [" in text and "| UniformDelay(0, 2), age +1 |" in text
     assert "| control period | 40 ms |" in text
+    assert f"| SHA-256 | `{hashlib.sha256(agent.read_bytes()).hexdigest()}` |" in text
+    assert "denoising steps at temperature" in text
 
 
 def test_returns_of_another_file_are_refused(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -63,6 +67,20 @@ def test_the_command_has_what_is_not_the_presets() -> None:
     assert command.endswith("-n 90 --seed 3 -params planner_gradient_steps:7 'ent_coef:'\"'\"'auto_0.2'\"'\"''")
     smoke = {"planner_kwargs": {"d_model": 64, "batch_size": 32}, "planner_trial_episodes": 2}
     assert card.made_by(replace(record, preset="smoke", hyperparams=smoke)).endswith("-params planner_trial_episodes:2")
+
+
+def test_the_command_makes_the_agent_again_whatever_the_preset_says_since() -> None:
+    """The run was of a preset without gamma, when the constructor's default was .99; and of a task with arguments."""
+    record = Record("said", "Hopper-v5", 1, 4, hyperparams={"planner_terminal_penalty": -100.0},
+                    options={"trained_agent": "old.zip"}, env_kwargs={"forward_reward_weight": 2.0})  # fmt: skip
+    command = card.made_by(record, SimpleNamespace(gamma=0.99, planner_kwargs={"depth": 2}))
+    assert command.endswith("-i old.zip --seed 1 -params gamma:0.99 --env-kwargs forward_reward_weight:2.0")
+
+
+def test_the_trials_steps_are_those_of_the_log(tmp_path: Path) -> None:
+    assert card.trial_steps(tmp_path) == 0
+    (tmp_path / "progress.csv").write_text("time,trial/steps,x\n1,,2\n2,340.0,\n3,60.0,\n")
+    assert card.trial_steps(tmp_path) == 400
 
 
 def test_a_file_alone_names_its_task(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

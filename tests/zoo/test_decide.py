@@ -17,6 +17,7 @@ from small_run import ENV, TINY_PLANNER, write_run
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.evaluation import collect_observations
+from sb3_said.files.normalization import normalization_file
 from sb3_said.zoo import decide, evaluate
 
 NEW = ["--temperature", "0.5", "--n-candidates", "3", "--choice-factor", "2", "--sampling-steps", "1"]
@@ -78,6 +79,18 @@ def test_who_answers_is_set_and_shown(run: Path, tmp_path: Path, capsys: pytest.
     assert "answers        both: the expert up to age 0  (new)" in capsys.readouterr().out
     assert load(new).policy.who_answers == "both" and load(new).policy.expert_up_to == 0
     assert list(results(new, tmp_path)) == ["planner", "expert", "both"]
+    newer = tmp_path / "newer.zip"
+    decide.main([str(new), "--expert-up-to", "1", "-o", str(newer)])  # both answer already
+    assert load(newer).policy.expert_up_to == 1
+
+
+def test_statistics_of_normalised_observations_go_with_the_file(run: Path, tmp_path: Path) -> None:
+    source = tmp_path / "agent.zip"
+    source.write_bytes((run / f"{ENV}.zip").read_bytes())
+    normalization_file(source).write_bytes(b"statistics")
+    decide.main([str(source), "--compact", "-o", str(tmp_path / "elsewhere" / "small.zip")])
+    assert normalization_file(tmp_path / "elsewhere" / "small.zip").read_bytes() == b"statistics"
+    decide.main([str(source), "--compact", "-o", str(source)])  # in place
 
 
 def test_without_settings_it_shows_them(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -94,7 +107,8 @@ def test_without_settings_it_shows_them(run: Path, capsys: pytest.CaptureFixture
         (["{run}", "--temperature", "-1", "-o", "x.zip"], "temperature is -1.0, expected at least 0"),
         (["{run}", "--scored-states", "some", "-o", "x.zip"], "expected one of ('future', 'decision', 'all')"),
         (["{run}", "--answer", "both", "-o", "x.zip"], "expert_up_to is None, expected an age in 0..1"),
-        (["{run}", "--expert-up-to", "1", "-o", "x.zip"], "add --temperature"),
+        (["{run}", "--expert-up-to", "1"], "-o is missing"),
+        (["{run}", "--expert-up-to", "1", "-o", "x.zip"], "needs set_answer('both')"),
         (["{run}", "--choice-factor", "best", "-o", "x.zip"], "invalid"),
         (["{sadr}"], "is a run of 'sadr', which has no planner"),
         (["{sadr_zip}"], "SAID"),

@@ -231,10 +231,13 @@ def test_an_agent_beside_itself_that_ignores_the_delay(
     )
     monkeypatch.setattr(enjoy, "check_can_record", lambda path: None)
     film = tmp_path / "film.gif"
-    enjoy.main([str(run), "--record", str(film), "--beside-ignorant", "--delay", "2", "--device", "cpu"])
+    words = [str(run), "--record", str(film), "--beside-ignorant", "--delay", "2", "--device", "cpu", "--episodes", "2"]
+    enjoy.main(words)
     out = capsys.readouterr().out
-    lengths = [int(line.split()[-2]) for line in out.splitlines() if line.startswith("seed 10000")]
-    assert "seed 10000, told that every observation is new: return" in out and len(lengths) == 2
+    told = [line.split(":")[0] for line in out.splitlines() if line.startswith("seed")]
+    ignorant = ", told that every observation is new"
+    assert told == ["seed 10000" + ignorant, "seed 10000", "seed 10001" + ignorant, "seed 10001"]  # pairs of one start
+    lengths = [int(line.split()[-2]) for line in out.splitlines() if line.startswith("seed 10001")]
     frames = imageio.imread(film)
     assert frames.shape[1:] == (16, 32, 3) and f"{len(frames)} frames" in out
     shorter = frames[-1, :, :16] if lengths[0] < lengths[1] else frames[-1, :, 16:]
