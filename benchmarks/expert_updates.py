@@ -1,11 +1,12 @@
-"""How fast the expert learns: updates of DelayedSAC beside SB3's SAC, turn by turn, on one thread.
+"""How fast the expert learns: updates of DelayedSAC and StableSAC beside SB3's SAC, turn by turn, on one thread.
 
     python benchmarks/expert_updates.py --json results/speed/expert_updates.json
 
-All make the same update (SB3's default networks and batch, Hopper-v5) on a replay buffer of their own, sampling
-included. "time, SAC's = 1" is the median of the ratios turn by turn, with its 95 % interval: above 1 is slower than
-SB3's SAC. "fraction of floor" is the time of the matrix products alone over the time of an update. The products are
-counted from their shapes, at the rate that large products reach on this machine and thread count.
+All have SB3's default networks and batch (Hopper-v5) and a replay buffer of their own; sampling is included. StableSAC
+updates its actor every second time, and keeps an average of it. "time, SAC's = 1" is the median of the ratios turn by
+turn, with its 95 % interval: above 1 is slower than SB3's SAC. "fraction of floor" is the time of the matrix products
+alone over the time of an update. The products are counted from their shapes, at the rate that large products reach on
+this machine and thread count.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
 from torch import nn
 
-from sb3_said import DelayedObservationWrapper, DelayedSAC
+from sb3_said import DelayedObservationWrapper, DelayedSAC, StableSAC
 
 UPDATES_PER_TURN = 20
 
@@ -35,14 +36,15 @@ def make(cls: type[SAC], delay: int, args: argparse.Namespace) -> SAC:
     return model.learn(args.steps, log_interval=None)
 
 
-def matmul_flops(model: SAC, batch_size: int) -> int:
-    """Count the floating-point operations of one update's matrix products, as autograd makes them.
+def matmul_flops(model: SAC, batch_size: int) -> float:
+    """Count the floating-point operations of one update's matrix products, as autograd makes them, on average.
 
     A product forward takes two operations a weight and row; backward as many for the input's gradient and as many for
     the weights'. No layer that reads data needs its input's gradient.
 
     The actor runs for the next state, and for this one with a pass back. The critics run for the target, for the fit
-    with a pass back, and for the actor's loss with a pass back to their input; that one reaches their weights, too.
+    with a pass back, and for the actor's loss with a pass back to their input; that one reaches their weights, too, but
+    for StableSAC's, which makes it every ``policy_delay`` updates.
     """
 
     def weights(net: nn.Module) -> list[int]:
@@ -50,9 +52,10 @@ def matmul_flops(model: SAC, batch_size: int) -> int:
 
     actor = weights(model.actor)
     critics = [weights(net) for net in model.critic.q_networks]
-    actor_passes = 4 * sum(actor) - actor[0]
-    critic_passes = sum(7 * sum(critic) - critic[0] for critic in critics)
-    return 2 * batch_size * (actor_passes + critic_passes)
+    of_critics = sum(4 * sum(critic) - critic[0] for critic in critics)
+    passes, every = (2, model.policy_delay) if isinstance(model, StableSAC) else (3, 1)
+    of_actor = 3 * sum(actor) - actor[0] + passes * sum(sum(critic) for critic in critics)
+    return 2 * batch_size * (sum(actor) + of_critics + of_actor / every)
 
 
 def read_arguments(argv: list[str] | None) -> argparse.Namespace:
@@ -73,6 +76,7 @@ def main(argv: list[str] | None = None) -> list[dict[str, Any]]:
         "SB3's SAC": make(SAC, 0, args),
         "DelayedSAC at delay 0": make(DelayedSAC, 0, args),
         f"DelayedSAC at delay {args.delay}": make(DelayedSAC, args.delay, args),
+        f"StableSAC at delay {args.delay}": make(StableSAC, args.delay, args),
     }
     rate = matmul_rates(args)["float32"]
     progress(f"{args.rounds} turns of {UPDATES_PER_TURN} updates: {', '.join(models)}")

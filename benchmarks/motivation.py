@@ -43,10 +43,22 @@ from sb3_said.offline.belief import (
     belief_error,
     train_belief,
 )
+from sb3_said.zoo.runs import LoadedRun, load_run, origin
 
 N_WINDOWS = 5_000  # held out, at most
 PLAIN: dict[str, type[LearnedBelief]] = {"rolled out": RolledOutModel, "regressed": RegressedPresent}
 PLAYERS = ["inpainted", *PLAIN, "old observation", "SAID", "one step", "cloning"]
+
+
+def load_agent(path: str | Path, device: str = "cpu") -> LoadedRun:
+    """Open a trained agent that reads states as they are.
+
+    :raises SystemExit: for one that was trained under VecNormalize
+    """
+    run = load_run(path, device=device)
+    if run.normalize is not None:
+        raise SystemExit(f"{path} was trained under VecNormalize, which is not applied here; give another agent.")
+    return run
 
 
 class OldObservation:
@@ -112,12 +124,7 @@ def train(data: Dataset, args: argparse.Namespace) -> tuple[dict[str, Belief], A
         bc = BC("MultiInputPolicy", env, seed=args.seed, device=args.device, buffer_size=args.max_delay + 2)
         return bc.learn_offline(data, args.plain_steps, progress_bar=True)
 
-    if args.actor is not None:
-        from sb3_said.zoo.runs import load_run
-
-        actor: Any = load_run(args.actor, device=args.device).model
-    else:
-        actor = clone(task)
+    actor: Any = clone(task) if args.actor is None else load_agent(args.actor, args.device).model
     beliefs: dict[str, Belief] = {"inpainted": PlannerBelief(said.policy.planner), **networks}
     beliefs["old observation"] = OldObservation(args.max_delay)
     return beliefs, actor, said, clone(env)
@@ -183,7 +190,8 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     p.add_argument("--delays", type=int, nargs="+", default=[0, 1, 2, 4, 8, 12, 16])
     p.add_argument("--gradient-steps", type=int, default=25_000, help="of the planner")
     p.add_argument("--plain-steps", type=int, help="of each plain network (default: those of the planner)")
-    p.add_argument("--terminal-penalty", type=float, default=0.0, help="of an end by falling, in the planner's values")
+    p.add_argument("--terminal-penalty", type=float, help="in place of the reward of a step that ends the task, in the "
+                   "planner's values (default: none)")  # fmt: skip
     p.add_argument("--actor", help="run folder or .zip of an agent of the task without delay (default: BC)")
     p.add_argument("--players", nargs="+", choices=PLAYERS, default=PLAYERS, help="whose return is measured")
     p.add_argument("--held-out", type=float, default=0.05, help="part of the episodes that no network learns from")
@@ -203,14 +211,10 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     th.set_num_threads(args.num_threads)
 
     task = gym.make(args.env)
-    data = load_dataset(args.dataset, task.observation_space, task.action_space, args.env)
+    data = load_dataset(args.dataset, task.observation_space, task.action_space, args.env, progress_bar=True)
     training, held = split(data, args.held_out, args.seed)
     beliefs, actor, said, cloning = train(training, args)
-    document: dict[str, Any] = {
-        name: getattr(args, name)
-        for name in ("env", "dataset", "delays", "gradient_steps", "plain_steps", "episodes", "seed", "actor")
-    }
-    document["terminal_penalty"] = args.terminal_penalty
+    document: dict[str, Any] = {k: v for k, v in vars(args).items() if k not in ("folder", "json", "plot")}
     document |= {"training_steps": len(training), "held_out_steps": len(held), "held_out_episodes": len(held.lengths)}
     document["planner"] = said.policy.planner.config.to_dict()
     document["errors"] = errors(held, beliefs, args)
@@ -226,6 +230,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
         document["scores"] = {
             name: [float(normalized_score(s.mean_return.value, args.env)) for s in row] for name, row in table.items()
         }
+    document["origin"] = origin(LoadedRun(said, lambda: task, None, Path(), {}))
     if args.json is not None:
         write_json(args.json, document)
     if args.plot is not None:

@@ -34,7 +34,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from measure import progress
-from motivation import OldObservation
+from motivation import OldObservation, load_agent
 
 from sb3_said import SAID, DelayedObservationWrapper
 from sb3_said.delays.space import KEYS, UNDELAYED
@@ -42,7 +42,7 @@ from sb3_said.evaluation import confidence_interval, rollout
 from sb3_said.files.atomic import write_json
 from sb3_said.offline import Dataset, load_dataset
 from sb3_said.offline.belief import BeliefOnly
-from sb3_said.zoo.runs import load_run
+from sb3_said.zoo.runs import origin
 
 PRESENTS = "presents"  # key of the true states s_{t-D..t}
 HELD = (2, 4)
@@ -212,20 +212,27 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     p.add_argument("--json", type=Path, required=True, help="file of the numbers, read and written")
     args = p.parse_args(argv)
     th.set_num_threads(args.num_threads)
-    said: Any = load_run(args.run, device="cpu").model
+    run = load_agent(args.run)
+    said: Any = run.model
     if not isinstance(said, SAID):
         p.error(f"{args.run} is a {type(said).__name__}; give a SAID agent.")
+    settings: dict[str, Any] = {"run": str(args.run), "trained_steps": said.num_timesteps}
+    settings |= {name: getattr(args, name) for name in ("dataset", "actor", "episodes", "eval_seed", "seed")}
+    document: dict[str, Any] = {"settings": settings, "delays": {}}
+    if args.json.exists():
+        document = json.loads(args.json.read_text())
+        if (found := document.get("settings")) != settings:
+            p.error(f"{args.json} has rows of {found}, and these would be of {settings}; give another --json.")
     task = gym.make(said.task or "")
-    data = load_dataset(args.dataset, task.observation_space, task.action_space, said.task)
+    data = load_dataset(args.dataset, task.observation_space, task.action_space, said.task, progress_bar=True)
     neighbours = Neighbours(data)
-    actor = None if args.actor is None else load_run(args.actor, device="cpu").model
+    actor = None if args.actor is None else load_agent(args.actor).model
 
     def make_env(delay: int) -> gym.Env[Any, Any]:
         return ShowPresents(
             DelayedObservationWrapper(gym.make(said.task or ""), delay, max_delay=said.policy.max_delay)
         )
 
-    document: dict[str, Any] = json.loads(args.json.read_text()) if args.json.exists() else {"delays": {}}
     for delay in args.delays:
         rows = document["delays"].setdefault(str(delay), {})
         for name, player in players(said, neighbours, actor).items():
@@ -234,6 +241,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
                 progress(f"{name} plays {args.episodes} episodes at delay {delay}")
                 played = rollout(player, partial(make_env, delay), args.episodes, args.eval_seed, args.episodes)
                 rows[name] = player.found(played.returns)
+                document["origin"] = origin(run)
                 write_json(args.json, document)
     drawn = th.as_tensor(np.random.default_rng(args.seed).choice(len(data), min(2_000, len(data)), replace=False))
     parts = [

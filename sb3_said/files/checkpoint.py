@@ -170,9 +170,11 @@ def training_state(
 
 
 def checksum(model: OffPolicyAlgorithm) -> int:
-    """Return a number that tells replays apart: of their actions, a few of which agree by chance in no two."""
-    replay = _replay_buffer(model)
-    return zlib.crc32(np.ascontiguousarray(replay.actions[: replay.size()]).data)
+    """Return a number that tells replays apart, of all that they teach."""
+    replay, found = _replay_buffer(model), 0
+    for name in ("observations", "actions", "rewards", "dones", "timeouts"):
+        found = zlib.crc32(np.ascontiguousarray(getattr(replay, name)[: replay.size()]).data, found)
+    return found
 
 
 def evaluations_of(callback: BaseCallback | None) -> list[dict[str, Any]]:

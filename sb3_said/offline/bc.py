@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from torch.nn import functional as F
 
 from sb3_said.offline.learning import OfflineAlgorithm
+from sb3_said.sac.policies import DelayedSACPolicy
 
 
 class BC(OfflineAlgorithm):
@@ -17,8 +21,31 @@ class BC(OfflineAlgorithm):
     :param policy: ``"MultiInputPolicy"`` or ``"MlpPolicy"``, which name the same class
     :param env: a task in a ``DelayedObservationWrapper``, or one with a 1-D Box observation (delay 0)
     :param learning_rate: of the actor (CORL's BC: 3e-4)
+    :param normalise_states: read z-scores of states, with mean and deviation of the dataset (CORL's BC: ``normalize``)
     :param sac_kwargs: every other argument of :class:`~sb3_said.sac.DelayedSAC`; those of its critics have no effect
     """
+
+    def __init__(
+        self,
+        policy: str | type[DelayedSACPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 3e-4,
+        *,
+        normalise_states: bool = True,
+        **sac_kwargs: Any,
+    ):
+        self.normalise_states = normalise_states
+        super().__init__(policy, env, learning_rate, **sac_kwargs)
+
+    def _policy_flags(self) -> dict[str, Any]:
+        return {**super()._policy_flags(), "normalise_states": self.normalise_states}
+
+    def take_dataset(self, dataset: Any, progress_bar: bool = False) -> None:
+        """Replace the replay buffer by a dataset, as every offline algorithm does, and look at its states."""
+        super().take_dataset(dataset, progress_bar)
+        if self.policy.state_normalizer is not None:
+            states = self.replay_buffer.window_source(env=self._vec_normalize_env).start_states()  # (N, obs_dim)
+            self.policy.state_normalizer.fit(states.to(self.device), 0)
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
         """Make gradient steps on batches of the replay buffer."""

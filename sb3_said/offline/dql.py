@@ -230,7 +230,9 @@ class DQL(OfflineAlgorithm):
 
     :param policy: ``"MultiInputPolicy"`` or ``"MlpPolicy"``, which name the same class
     :param env: a task in a ``DelayedObservationWrapper``, or one with a 1-D Box observation (delay 0)
-    :param learning_rate: of actor and critics (paper: 3e-4; its MuJoCo commands let it fall to 0 by a cosine)
+    :param learning_rate: of actor and critics (paper: 3e-4)
+    :param lr_decay: let it fall to 0 by a cosine over the training, as CleanDiffuser's DQL does. The paper's commands
+        have ``--lr_decay``, too, but its code makes 40 of the schedule's 2,000 steps: the rate loses 0.1 %
     :param diffusion_kwargs: fields of :class:`DQLConfig`
     :param sac_kwargs: every other argument of :class:`~sb3_said.sac.DelayedSAC`; batch size 256, gamma 0.99 and tau
         0.005 are the paper's
@@ -246,16 +248,24 @@ class DQL(OfflineAlgorithm):
         env: GymEnv | str,
         learning_rate: float | Schedule = 3e-4,
         *,
+        lr_decay: bool = False,
         diffusion_kwargs: dict[str, Any] | None = None,
         delay_reconciled_critic: bool = False,
         **sac_kwargs: Any,
     ):
+        self.lr_decay = lr_decay
         self.diffusion_kwargs = diffusion_kwargs or {}
         sac_kwargs |= {"delay_reconciled_critic": delay_reconciled_critic}
         super().__init__(policy, env, learning_rate, **sac_kwargs)
 
     def _policy_flags(self) -> dict[str, Any]:
         return {**super()._policy_flags(), "diffusion_kwargs": self.diffusion_kwargs}
+
+    def _setup_lr_schedule(self) -> None:
+        super()._setup_lr_schedule()
+        if self.lr_decay:
+            given = self.lr_schedule
+            self.lr_schedule = lambda remaining: given(remaining) * 0.5 * (1.0 - math.cos(math.pi * remaining))
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
         """Make gradient steps on batches of the replay buffer."""

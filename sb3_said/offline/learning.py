@@ -7,7 +7,8 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback, ProgressBarCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import configure_logger
 
@@ -15,6 +16,14 @@ from sb3_said.offline.datasets import load_dataset
 from sb3_said.sac import DelayedSAC
 
 SelfOffline = TypeVar("SelfOffline", bound="OfflineAlgorithm")
+
+
+class GradientStepBar(ProgressBarCallback):
+    """SB3's progress bar, which counts the steps of environments, for gradient steps."""
+
+    def _on_step(self) -> bool:
+        self.pbar.update()
+        return True
 
 
 class OfflineAlgorithm(DelayedSAC):
@@ -40,22 +49,30 @@ class OfflineAlgorithm(DelayedSAC):
         :param dataset: whatever :func:`~sb3_said.offline.load_dataset` reads; None for what :meth:`take_dataset` took
         :param gradient_steps: to make
         :param callback: SB3 callbacks, such as ``EvalCallback``
-        :param log_interval: gradient steps between two rows of the log; None for none
+        :param log_interval: gradient steps between two rows of the log, the last of which is at the end; None for none
         :param tb_log_name: name of the run in TensorBoard, the class's by default
         :param reset_num_timesteps: count from 0
         :param progress_bar: show one
-        :raises ValueError: as ``load_dataset`` does
+        :raises ValueError: as ``load_dataset`` does, and without the wrapper that gives a delayed agent its ages
         """
+        if isinstance(self.observation_space, spaces.Dict) and self._draw_ages() is None:
+            raise ValueError(
+                f"{type(self).__name__} learns at the ages that a DelayedObservationWrapper gives, and has none: give "
+                "it the environment, with load(..., env=env) or set_env(env). It is not stepped."
+            )
         watcher = self._begin_offline(dataset, gradient_steps, callback, tb_log_name, reset_num_timesteps, progress_bar)
         watcher.on_training_start(locals() | {"total_timesteps": self._total_timesteps, "callback": watcher}, globals())
         while self.num_timesteps < self._total_timesteps:
             watcher.on_rollout_start()
+            self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)  # a rate may fall
             self.train(1, self.batch_size)
             self.num_timesteps += 1
             if log_interval is not None and self.num_timesteps % log_interval == 0:
                 self.logger.dump(self.num_timesteps)
             if not self._goes_on(watcher):
                 break
+        if log_interval is not None and self.logger.name_to_value:  # since the last row
+            self.logger.dump(self.num_timesteps)
         watcher.on_training_end()
         return self
 
@@ -79,7 +96,11 @@ class OfflineAlgorithm(DelayedSAC):
         if not self._custom_logger:
             name = tb_log_name or type(self).__name__
             self._logger = configure_logger(self.verbose, self.tensorboard_log, name, reset_num_timesteps)
-        return self._init_callback(callback, progress_bar)
+        if not progress_bar:
+            return self._init_callback(callback)
+        given = CallbackList(callback) if isinstance(callback, list) else callback
+        given = given if isinstance(given, BaseCallback) else ConvertCallback(given)
+        return self._init_callback([given, GradientStepBar()])
 
     def _goes_on(self, watcher: BaseCallback) -> bool:
         """Call the callbacks after a gradient step; return whether learning goes on."""
@@ -96,7 +117,7 @@ class OfflineAlgorithm(DelayedSAC):
         :raises ValueError: as ``load_dataset`` does
         """
         spec = None if self.env is None else self.env.get_attr("spec", 0)[0]
-        env_id = None if spec is None else spec.id
+        env_id = self.task if spec is None else spec.id
         data = load_dataset(dataset, self.observation_space, self.action_space, env_id, progress_bar)
         vec_normalize = self._vec_normalize_env
         if vec_normalize is not None and vec_normalize.norm_obs and vec_normalize.training:
@@ -111,14 +132,23 @@ class OfflineAlgorithm(DelayedSAC):
         )
 
     def _draw_ages(self) -> Callable[[int], np.ndarray] | None:
-        """Return how to draw the ages of an episode, which its environment's receiver does in play."""
-        if self.env is None or not self.env.has_attr("receiver"):
+        """Return how to draw the ages of an episode, as its environment's receiver and actuator do in play."""
+        is_delayed = isinstance(self.observation_space, spaces.Dict)
+        if self.env is None or not is_delayed or not self.env.has_attr("receiver"):
             return None
-        receiver = self.env.get_attr("receiver", 0)[0]
+        receiver, actuator = (self.env.get_attr(name, 0)[0] for name in ("receiver", "actuator"))
         rng = np.random.default_rng(self.seed)
 
+        def step() -> int:
+            if actuator is not None:
+                actuator.execute(np.zeros(()))
+            age = receiver.step()
+            return age if actuator is None else age + actuator.lag(age)
+
         def draw(n_steps: int) -> np.ndarray:
+            if actuator is not None:
+                actuator.reset(rng.spawn(1)[0])
             receiver.reset(rng)
-            return np.array([0, *(receiver.step() for _ in range(n_steps))])
+            return np.array([0, *(step() for _ in range(n_steps))])
 
         return draw

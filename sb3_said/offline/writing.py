@@ -1,4 +1,4 @@
-"""Datasets into files that others read, too: an ``.npz`` with D4RL's columns, or a Minari dataset."""
+"""Datasets into files that others read, too: an ``.npz`` with D4RL's columns and the task's id, or a Minari dataset."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ from sb3_said.delays.space import check_spaces, unscale_action
 from sb3_said.files.atomic import replacing
 from sb3_said.offline.datasets import Dataset, is_file
 from sb3_said.offline.scores import reference_returns
+from sb3_said.offline.sources import TASK
 
 
 def check_target(target: str | os.PathLike[str]) -> None:
     """Refuse a place where a dataset cannot be written, before it is made.
 
     :param target: path of an ``.npz``, or id of a Minari dataset such as ``"hopper/mine-v0"``
-    :raises ValueError: for a file of another format, and for one that is there already
+    :raises ValueError: for a file of another format, no id of a Minari dataset, and what is there already
     :raises ImportError: without Minari
     """
     if is_file(target):
@@ -33,7 +34,14 @@ def check_target(target: str | os.PathLike[str]) -> None:
     name = os.fspath(target)
     if not name.rpartition("-v")[2].isdigit():
         raise ValueError(f"{name!r} is neither an .npz nor an id of Minari, which ends in its version: {name}-v0.")
-    if name in _minari().list_local_datasets():
+    minari = _minari()
+    from minari.dataset.minari_dataset import parse_dataset_id
+
+    try:
+        parse_dataset_id(name)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{name!r} is no id of a Minari dataset, such as hopper/mine-v0: {error}") from error
+    if name in minari.list_local_datasets():
         raise ValueError(f"Minari has a dataset {name} already; give another name or version.")
 
 
@@ -52,7 +60,7 @@ def write_dataset(
     check_target(target)
     state_space, _ = check_spaces(env.observation_space, env.action_space)
     assert isinstance(env.action_space, gym.spaces.Box)  # as check_spaces says
-    actions = unscale_action(data.actions, env.action_space)
+    actions, spec = unscale_action(data.actions, env.action_space), env.unwrapped.spec
     if is_file(target):
         columns = {
             "observations": data.states,
@@ -62,6 +70,7 @@ def write_dataset(
             "timeouts": data.ends & ~data.terminated,
             "next_observations": data.next_states,
             "about": np.array(about),
+            **({} if spec is None else {TASK: np.array(spec.id)}),
         }
         with replacing(target) as file:
             np.savez(file, **columns)
@@ -69,7 +78,6 @@ def write_dataset(
     from minari.data_collector import EpisodeBuffer
 
     stops = np.flatnonzero(data.ends) + 1
-    spec = env.unwrapped.spec
     if spec is not None:  # what was registered, with the arguments that were given; its own lacks the time limit
         spec, kwargs = copy.deepcopy(gym.spec(spec.id)), spec.kwargs
         spec.kwargs = {**spec.kwargs, **kwargs}

@@ -9,6 +9,7 @@ import sys
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, SupportsFloat
 
@@ -16,6 +17,8 @@ import gymnasium as gym
 import numpy as np
 import stable_baselines3
 import torch as th
+from huggingface_sb3 import EnvironmentName
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from tqdm import tqdm
 
 from sb3_said.delays.space import EXECUTED, UNDELAYED, check_spaces, scale_action
@@ -24,6 +27,7 @@ from sb3_said.offline.scores import normalized_score, reference_returns
 from sb3_said.offline.writing import check_target, write_dataset
 from sb3_said.zoo.arguments import add_delay, add_playing, check_positive, explained, make_parser, read_delay
 from sb3_said.zoo.manager import ALGOS
+from sb3_said.zoo.record import import_packages
 from sb3_said.zoo.runs import LoadedRun, answering, load_run, origin
 
 EPILOG = """\
@@ -34,7 +38,8 @@ examples:
   # half an agent's, half random actions, into a Minari dataset; an agent named twice has twice the share
   sb3-said collect logs/sadr/Hopper-v5-seed1_1 random -o hopper/mixed-v0
 
-  # an agent of Stable-Baselines3; opening its file runs what is pickled in it
+  # an agent of Stable-Baselines3, which reads what a vecnormalize.pkl beside it normalises, where rl_zoo3 leaves one;
+  # opening either file runs what is pickled in it
   sb3-said collect ppo_hopper.zip --algo ppo --env Hopper-v5 -o hopper_ppo.npz
 
   # an agent of ours that acts under delay: the log has the true states all the same
@@ -58,11 +63,14 @@ class Episode:
     """as they were executed, scaled to [-1, 1]"""
     rewards: list[float] = field(default_factory=list)
     terminated: bool = False
+    seed: int = 0
+    """of its reset"""
 
     def cut(self, n_steps: int) -> Episode:
         """Return the first steps of it."""
         ended = self.terminated and n_steps >= len(self.rewards)
-        return Episode(self.states[: n_steps + 1], self.actions[:n_steps], self.rewards[:n_steps], ended)
+        kept = self.states[: n_steps + 1], self.actions[:n_steps], self.rewards[:n_steps]
+        return Episode(*kept, ended, self.seed)
 
 
 class Recorder(gym.Wrapper[Any, Any, Any, Any]):
@@ -77,7 +85,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(**kwargs)
-        self.episode = Episode([true_state(observation, info)])
+        self.episode = Episode([true_state(observation, info)], seed=kwargs.get("seed") or 0)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -155,7 +163,10 @@ def main(argv: list[str] | None = None) -> None:
             raise ValueError(f"--noise is a standard deviation, 0 or more, got {min(args.noise)}.")
         check_target(args.output)
         th.set_num_threads(args.num_threads)
-        shares = list(open_agents(args))
+        try:
+            shares = list(open_agents(args))
+        except gym.error.Error as error:
+            raise ValueError(f"{error} A package that registers a task is named with --gym-packages.") from error
         if args.steps < len(shares):
             raise ValueError(f"--steps is {args.steps}, fewer than there are shares, {len(shares)}.")
         parts = []
@@ -176,8 +187,11 @@ def main(argv: list[str] | None = None) -> None:
 def open_agents(args: argparse.Namespace) -> Iterator[Share]:
     """Open each agent, at each noise level.
 
-    :raises ValueError: for what cannot be opened, agents of several tasks, or random actions alone of no task
+    :raises ValueError: for what cannot be opened, agents of several tasks, random actions alone of no task, or a task
+        with other spaces
+    :raises gymnasium.error.Error: for a task that is not registered
     """
+    import_packages(args.gym_packages)
     names = dict.fromkeys(args.agents)
     runs = {name: open_agent(name, args) for name in names if name != "random"}
     tasks = {run.info["env"]: run for run in runs.values()}
@@ -189,6 +203,10 @@ def open_agents(args: argparse.Namespace) -> Iterator[Share]:
         make_env = next(iter(runs.values())).make_env if runs else lambda: gym.make(args.env)
         info = {"env": args.env or next(iter(tasks)), "algo": "random"}
         runs["random"] = LoadedRun(None, make_env, None, Path(), info)  # type: ignore[arg-type]
+    for run in runs.values():
+        env = run.make_env()
+        check_spaces(env.observation_space, env.action_space)
+        env.close()
     for name in args.agents:
         for noise in args.noise if name != "random" else [0.0] * len(args.noise):
             yield Share(name, runs[name], noise)
@@ -208,8 +226,31 @@ def open_agent(name: str, args: argparse.Namespace) -> LoadedRun:
     if args.delay:
         raise ValueError(f"{path} is of Stable-Baselines3, whose agents know no delay: leave out --delay.")
     cls: Any = getattr(stable_baselines3, args.algo.upper(), ALGOS[args.algo])  # "sac" is ours in ALGOS
-    model = cls.load(path, device=args.device)
-    return LoadedRun(model, lambda: gym.make(args.env), None, path.parent, {"env": args.env, "algo": args.algo})
+    model, info = cls.load(path, device=args.device), {"env": args.env, "algo": args.algo}
+    return LoadedRun(model, partial(gym.make, args.env), normalization_beside(path, args.env), path.parent, info)
+
+
+def normalization_beside(path: Path, env_id: str) -> Callable[[Any], Any] | None:
+    """Return VecNormalize's normalisation of observations where an agent of Stable-Baselines3 has one, and print it.
+
+    :param path: of the agent; ``vecnormalize.pkl`` lies beside it, or in the folder that is named after the task
+    :raises ValueError: for a file that cannot be opened, or is of another task
+    """
+    folders = path.parent, path.parent / EnvironmentName(env_id)
+    found = next((file for folder in folders if (file := folder / "vecnormalize.pkl").is_file()), None)
+    seen = "as they are; no vecnormalize.pkl is beside it" if found is None else f"normalised by {found}"
+    print(f"{path} sees observations {seen}.", file=sys.stderr)
+    if found is None:
+        return None
+    env = DummyVecEnv([partial(gym.make, env_id)])
+    try:
+        statistics = VecNormalize.load(str(found), env)
+    except Exception as error:  # pickle raises many kinds, and SB3 asserts what it needs
+        raise ValueError(f"{found} cannot be opened, or is of another task: {error}") from error
+    finally:
+        env.close()
+    statistics.training = False
+    return statistics.normalize_obs
 
 
 def play(share: Share, n_steps: int, seed: int, n_envs: int, deterministic: bool, bar: tqdm[Any]) -> list[Episode]:
@@ -229,7 +270,6 @@ def play(share: Share, n_steps: int, seed: int, n_envs: int, deterministic: bool
         return Recorder(share.run.make_env(), episodes, on_step)
 
     env = share.run.make_env()
-    check_spaces(env.observation_space, env.action_space)
     agent = NoisyAgent(share.run.model, env.action_space, share.noise, seed)  # type: ignore[arg-type]  # it is a Box
     env.close()
     player = replace(share.run, model=agent, make_env=make_env)  # type: ignore[arg-type]  # it has predict
@@ -240,7 +280,7 @@ def play(share: Share, n_steps: int, seed: int, n_envs: int, deterministic: bool
         with answering(share.run.model, who, at_once=True):
             player.play(n_episodes, seed + used, n_envs, deterministic=deterministic)
         used += n_episodes
-        for episode in episodes:
+        for episode in sorted(episodes, key=lambda episode: episode.seed):  # short ones end first
             if left > 0:
                 kept.append(episode.cut(left))
                 left -= len(kept[-1].rewards)

@@ -80,9 +80,8 @@ def main(argv: list[str] | None = None) -> None:
     if not model.policy.planner_is_trained:
         print("The planner of this agent is not trained yet.")
     up_to = f": the expert up to age {model.policy.expert_up_to}" if model.policy.who_answers == "both" else ""
-    print(
-        f"{'answers':14} {model.policy.who_answers}{up_to}{'  (new)' * (args.answer is not None or args.expert_up_to is not None)}"
-    )
+    is_new = args.answer is not None or args.expert_up_to is not None
+    print(f"{'answers':14} {model.policy.who_answers}{up_to}{'  (new)' * is_new}")
     if args.output is not None:
         keep_normalization(args.agent, args.output)
         model.save(args.output, compact=args.compact)

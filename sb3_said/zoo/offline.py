@@ -7,6 +7,7 @@ import sys
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import ProgressBarCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_said.files.checkpoint import TrainingCheckpointCallback
@@ -43,7 +44,7 @@ class OfflineExperimentManager(DelayedExperimentManager):
         model = made[0]
         try:
             model.take_dataset([*self.run.dataset], self.show_progress)
-        except (ValueError, ImportError) as error:
+        except (ValueError, ImportError, OSError) as error:
             sys.exit(f"sb3-said train: error: {error}")
         replay = model.replay_buffer
         print(f"Learning from {replay.size():,} logged steps; no environment is stepped but in evaluations.")
@@ -59,6 +60,10 @@ class OfflineExperimentManager(DelayedExperimentManager):
         """Make environments without a file of their episodes."""
         return super().create_envs(n_envs, eval_env, no_log=True)
 
+    def create_callbacks(self) -> None:
+        super().create_callbacks()  # whose bar counts the steps of environments
+        self.callbacks = [c for c in self.callbacks if not isinstance(c, ProgressBarCallback)]
+
     def _set_evaluation(self) -> None:
         pass  # there is no expert: it is the agent that is evaluated
 
@@ -72,7 +77,7 @@ class OfflineExperimentManager(DelayedExperimentManager):
         if isinstance(model, SAID):
             how |= {"folder": self.folder, "should_stop": self.stopping, "save_interval": self.run.checkpoint_freq}
             how["log_interval"] = how["log_interval"] or steps  # one row, at the end
-        model.learn_offline(None, steps, **how)
+        model.learn_offline(None, steps, progress_bar=self.show_progress, **how)
 
     def _save_checkpoint(self) -> bool:
         return self.algo == "said" or super()._save_checkpoint()  # a planner's is written when it is asked to stop

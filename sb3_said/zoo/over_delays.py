@@ -21,7 +21,7 @@ from sb3_said.delays import FixedDelay
 from sb3_said.delays.text import age_range, make_process
 from sb3_said.evaluation import Summary, plots
 from sb3_said.zoo.arguments import TRUST, add_playing, check_positive, explained, largest_delay, make_parser, read_delay
-from sb3_said.zoo.cells import Cell, Results, make_table, print_manners, print_table
+from sb3_said.zoo.cells import AGE, Cell, Results, make_table, print_manners, print_table
 from sb3_said.zoo.runs import ANSWERS, LoadedRun, answering, answers, delay_name, load_run, longest_delay, origin
 
 EPILOG = f"""\
@@ -86,7 +86,8 @@ def main(argv: list[str] | None = None) -> None:
     if args.plot is not None and any(table.values()):
         settings = Results(args.json).settings
         title = f"{settings['env']} under delay: means of {settings['n_episodes']} episodes, 95 % intervals"
-        plots.save(plots.plot_over_delays(table, title)[0], args.plot)
+        told_right = {row: {c: x for c, x in of_row.items() if AGE not in str(c)} for row, of_row in table.items()}
+        plots.save(plots.plot_over_delays(told_right, title)[0], args.plot)
         print(f"Wrote {args.plot}")
 
 

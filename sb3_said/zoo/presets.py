@@ -25,8 +25,11 @@ def config_file(algo: str, offline: bool = False) -> Path:
 
 
 def dataset_kind(dataset: Sequence[str]) -> str:
-    """Return which of D4RL's kinds a dataset is by its name: medium-expert, medium-replay, or else medium."""
-    name = " ".join(dataset).lower()
+    """Return which of D4RL's kinds a dataset is by its name: medium-expert, medium-replay, or else medium.
+
+    :param dataset: paths, whose folders say nothing, and ids of Minari datasets
+    """
+    name = " ".join(Path(source).stem for source in dataset).lower()
     return "medium-replay" if "replay" in name else "medium-expert" if "expert" in name else "medium"
 
 
@@ -44,19 +47,22 @@ def preset_overrides(
     ``planner_terminal_penalty`` for tasks that end by falling, and a larger ``gamma`` on legs. Two keys are for
     planners: ``planner_kwargs: {base: paper, ...}`` starts from ``PlannerConfig.paper()``, and ``planner_by_delay``
     holds settings to add, by the largest delay and under ``varies`` for delays that are not one number;
-    ``planner_by_dataset`` has such for each kind of dataset.
+    ``planner_by_dataset`` has such for each kind of dataset. Where the file has a ``by_dataset:`` beside its presets,
+    each of them also gets what that has for the task and the kind of dataset.
 
+    :param config: YAML; rl_zoo3 takes Python files, too, which have no presets
     :param max_delay: length of the action history, the largest of ``delay`` by default; a longer one varies, too
     :param dataset: logs to learn from, whose names tell their kind
     :raises ValueError: for a preset the file does not have
     """
-    if preset == "cpu":
-        return {}
-    presets = (yaml.safe_load(Path(config).read_text()) or {}).get("presets", {})
+    is_yaml, kind = Path(config).suffix in (".yml", ".yaml"), dataset_kind(dataset)
+    document = (yaml.safe_load(Path(config).read_text()) if is_yaml else None) or {}
+    presets = {"cpu": {"default": {}}, **document.get("presets", {})}
     if preset not in presets:
-        raise ValueError(f"{config} has no preset '{preset}', only {['cpu', *presets]}.")
-    overrides = dict(presets[preset].get(env_id, presets[preset]["default"]))
-    by_kind = overrides.pop("planner_by_dataset", {}).get(dataset_kind(dataset), {})
+        raise ValueError(f"{config} has no preset '{preset}', only {[*presets]}.")
+    suited = document.get("by_dataset", {}).get(env_id, {}).get(kind, {})
+    overrides = {**suited, **presets[preset].get(env_id, presets[preset]["default"])}
+    by_kind = overrides.pop("planner_by_dataset", {}).get(kind, {})
     by_delay = {**overrides.pop("planner_by_delay", {}), **by_kind}
     planner = dict(overrides.get("planner_kwargs", {}))
     if planner.pop("base", None) == "paper":

@@ -3,9 +3,12 @@
 import json
 
 import gymnasium as gym
-import motivation
 import numpy as np
 import pytest
+
+pytest.importorskip("rl_zoo3")
+
+import motivation
 
 from sb3_said.offline import Dataset, write_dataset
 
@@ -55,6 +58,9 @@ def test_it_measures_errors_and_returns_of_each_belief(log, tmp_path, capsys):
     written = json.loads((tmp_path / "m.json").read_text())
     assert written["errors"] == made["errors"] and written["planner"]["d_model"] == 32
     assert written["planner"]["embed_known"] is False
+    assert (written["held_out"], written["eval_seed"], written["terminal_penalty"]) == (0.3, 10_000, None)
+    assert written["dataset"] == [str(tmp_path / "log.npz")] and written["env"] == ENV
+    assert {"command", "date", "machine", "versions"} < set(written["origin"])
     names = ["inpainted", "rolled out", "regressed", "old observation"]
     assert list(written["errors"]) == names and list(written["returns"]) == [*names, "SAID", "one step", "cloning"]
     for name, (now, later) in written["errors"].items():

@@ -1,6 +1,7 @@
 """benchmarks/where_it_is_lost.py: each row replaces what it names, and nothing else."""
 
 import json
+import shutil
 from pathlib import Path
 
 import gymnasium as gym
@@ -12,9 +13,11 @@ pytest.importorskip("rl_zoo3")
 
 import where_it_is_lost as script
 from small_run import ENV, TINY_PLANNER, write_run
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.evaluation import rollout
+from sb3_said.files.normalization import normalization_file, save_normalization
 from sb3_said.offline import load_dataset
 from sb3_said.zoo import collect
 from sb3_said.zoo.runs import load_run
@@ -63,6 +66,12 @@ def test_rows_of_a_run(files, tmp_path, capsys):
     shown = capsys.readouterr()
     assert "| true present, age 0 | " in shown.out and "2 held plays 2 episodes at delay 2" in shown.err
     assert script.main([*words, "--delays", "0", "2"]) == found
+    assert {"command", "date", "machine", "versions"} < set(found["origin"])
+    settings = {"dataset": [str(log)], "actor": str(actor), "episodes": 2, "eval_seed": 10_000, "seed": 0}
+    assert found["settings"] == {"run": str(said), "trained_steps": 90, **settings}
+    with pytest.raises(SystemExit):  # rows of other episodes must not stand beside these
+        script.main([*words, "--eval-seed", "5"])
+    assert "and these would be of" in capsys.readouterr().err and json.loads(file.read_text()) == found
 
 
 def test_true_states_are_shown_oldest_first(files):
@@ -101,6 +110,17 @@ def test_a_held_plan_is_executed_in_its_order(files, log):
         actions, now = plans[-1]
         np.testing.assert_allclose(action, model.policy.unscale_action(actions[now + k % 2].numpy()), rtol=1e-5)
         observation = env.step(action)[0]
+
+
+def test_an_agent_that_reads_other_states_is_refused(files, tmp_path):
+    said, actor, log = files
+    shutil.copytree(actor, tmp_path / "actor-v0")
+    env = DummyVecEnv([lambda: DelayedObservationWrapper(gym.make(ENV), 0)])
+    statistics = VecNormalize(env, norm_obs_keys=["observation"])
+    save_normalization(normalization_file(tmp_path / "actor-v0" / f"{ENV}.zip"), statistics)
+    words = "--dataset", str(log), "--json", str(tmp_path / "lost.json"), "--actor", str(tmp_path / "actor-v0")
+    with pytest.raises(SystemExit, match="actor-v0 was trained under VecNormalize, which is not applied here"):
+        script.main([str(said), *words])
 
 
 def test_an_expert_alone_is_no_planner(files, tmp_path, capsys):

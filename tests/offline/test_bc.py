@@ -1,15 +1,21 @@
 """Behaviour cloning: it learns what the delay hides as far as history tells it, and steps no environment."""
 
+import csv
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
 from small_task import Drift, delayed
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from torch.nn import functional as F
 
 from sb3_said import DelayedObservationWrapper
 from sb3_said.offline import BC, Dataset
+from sb3_said.offline.learning import GradientStepBar
 
 DELAY = 3
 
@@ -74,12 +80,63 @@ def test_vec_normalize_learns_from_the_logs():
 
 
 def test_ages_are_those_of_play(learned):
-    ages = learned.replay_buffer.ages[:, 0].reshape(-1, 30)
+    ages = learned.replay_buffer.ages[:1200, 0].reshape(-1, 30)
     assert (ages == np.minimum(np.arange(30), DELAY)).all()
     varying = make(delayed(delay=(0, 2)))
     varying.take_dataset(demonstrations())
-    ages = varying.replay_buffer.ages[:, 0].reshape(-1, 30)
+    ages = varying.replay_buffer.ages[:1200, 0].reshape(-1, 30)
     assert set(ages[:, 5]) == {0, 1, 2} and (ages[:, 0] == 0).all() and (np.diff(ages[:, 3:]) == 0).all()
+
+
+def test_ages_count_the_actions_on_their_way_as_play_does():
+    env = DelayedObservationWrapper(Drift(length=40), delay=1, action_delay="UniformDelay(0, 2)")
+    draw = make(env, seed=5)._draw_ages()
+    drawn = [draw(40).tolist() for _ in range(3)]
+    env._rng = np.random.default_rng(5)
+    for ages in drawn:
+        played = [int(env.reset()[0]["delay"][0])]
+        played += [int(env.step(env.action_space.sample())[0]["delay"][0]) for _ in range(40)]
+        assert ages == played
+    assert {1, 2, 3} == {age for ages in drawn for age in ages[3:]}
+
+
+def test_without_an_environment_ages_are_unknown(learned, tmp_path):
+    learned.save(tmp_path / "bc.zip")
+    loaded = BC.load(tmp_path / "bc.zip", device="cpu")
+    with pytest.raises(ValueError, match=r"learns at the ages .* and has none: give it the environment"):
+        loaded.learn_offline(demonstrations(2), 1)
+    make(Drift()).save(tmp_path / "plain.zip")
+    assert BC.load(tmp_path / "plain.zip", device="cpu").learn_offline(demonstrations(2), 1).num_timesteps == 1
+
+
+@pytest.mark.parametrize("env", ["delayed", "plain"])
+def test_the_unit_of_a_state_does_not_matter(env):
+    """CORL's BC reads z-scores; without them a state in thousandths drowns the other, or is drowned."""
+
+    def error(unit, **kwargs):
+        scale = np.array([unit, 1.0], np.float32)
+
+        def in_unit(data):
+            return replace(data, states=data.states * scale, finals=data.finals * scale)
+
+        model = make(delayed(DELAY) if env == "delayed" else Drift(), **kwargs)
+        model.learn_offline(in_unit(demonstrations()), 150)
+        model.take_dataset(in_unit(demonstrations(seed=1)))
+        batch = model.replay_buffer.sample(1_000)
+        with th.no_grad():
+            return F.mse_loss(model.actor(batch.observations, deterministic=True), batch.actions).item()
+
+    plain, thousandths = error(1.0), error(1000.0)
+    assert thousandths < 1.5 * plain < 0.01
+    assert error(1000.0, normalise_states=False) > 5 * plain
+
+
+def test_the_scale_is_the_datasets_and_is_saved(learned, tmp_path):
+    data, normalizer = demonstrations(), learned.policy.state_normalizer
+    np.testing.assert_allclose(normalizer.mean, data.states.mean(0), atol=1e-5)
+    np.testing.assert_allclose(normalizer.deviation, data.states.std(0), atol=2e-4)
+    learned.save(tmp_path / "bc.zip")
+    assert th.equal(BC.load(tmp_path / "bc.zip").policy.state_normalizer.mean, normalizer.mean)
 
 
 def test_it_is_saved_and_loaded(learned, tmp_path):
@@ -102,6 +159,37 @@ def test_callbacks_follow_each_update_and_can_end_it():
     assert model.num_timesteps == model._n_updates == 7
     model.learn_offline(demonstrations(5), 5, reset_num_timesteps=False)
     assert model.num_timesteps == 12
+
+
+@pytest.mark.parametrize(("log_interval", "rows"), [(10, [10]), (4, [4, 8, 10]), (100, [10]), (None, [])])
+def test_the_last_row_of_the_log_is_at_the_end(log_interval, rows, tmp_path):
+    model = make()
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn_offline(demonstrations(5), 10, log_interval=log_interval)
+    with open(tmp_path / "progress.csv") as file:
+        written = list(csv.DictReader(file))
+    assert [int(row["train/n_updates"]) for row in written] == rows
+    assert all(float(row["train/action_error"]) > 0 for row in written)
+
+
+@pytest.mark.parametrize("n_envs", [None, 1, 2])
+def test_a_bar_counts_gradient_steps(n_envs, tmp_path, monkeypatch):
+    bars, calls, close = [], [], GradientStepBar._on_training_end
+
+    def note(bar):
+        bars.append((bar.pbar.n, bar.pbar.total))
+        close(bar)
+
+    monkeypatch.setattr(GradientStepBar, "_on_training_end", note)
+    if n_envs is None:
+        make(Drift()).save(tmp_path / "bc.zip")
+        model = BC.load(tmp_path / "bc.zip", device="cpu")
+    else:
+        model = make(DummyVecEnv([Drift] * n_envs))
+    count = ConvertCallback(lambda *given: calls.append(given) or True)
+    for callback in (None, count, [count], count.callback):
+        model.learn_offline(demonstrations(2), 5, callback=callback, progress_bar=True)
+    assert bars == [(5, 5)] * 4 and len(calls) == 15
 
 
 def test_equal_seeds_learn_alike_and_a_plain_task_is_delay_0():

@@ -1,15 +1,22 @@
 """Every source gives the same trajectories, and what is no log of the task is refused with its row."""
 
+import warnings
+from dataclasses import replace
+
+import gymnasium as gym
 import h5py
 import numpy as np
 import pytest
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from small_task import delayed
+from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
+from tqdm.auto import tqdm
 
 from sb3_said.delays.space import delayed_space
-from sb3_said.offline import Dataset, load_dataset
+from sb3_said.offline import Dataset, load_dataset, sources, write_dataset
 
 STATES = spaces.Box(-np.inf, np.inf, (3,), np.float32)
 ACTIONS = spaces.Box(np.float32([-2.0, 0.0]), np.float32([2.0, 1.0]))
@@ -119,6 +126,19 @@ def test_a_replay_samples_what_followed_each_step(log, tmp_path):
         assert batch.next_observations["delay"][i] == min(row - starts[row] + 1, 2)
 
 
+@pytest.mark.parametrize("delay", [1, 4])
+def test_a_replay_samples_every_step_and_has_every_window(delay, log, tmp_path):
+    """The first ones, too: nothing before them has been overwritten."""
+    data = load(write(tmp_path / "log.npz", log))
+    buffer = data.to_replay(delayed_space(STATES, ACTIONS, delay), ACTIONS)
+    sampled = {x.tobytes() for x in buffer.sample(500).observations["undelayed_observation"].numpy()}
+    assert sampled == {x.tobytes() for x in data.states}
+    source = buffer.window_source()
+    assert source.start_states().numpy().tobytes() == data.states.tobytes()
+    windows = source.gather(source.rows, 9)
+    assert windows.valid.sum(1).tolist() == source.remaining.tolist() == [*range(5, 0, -1), 1, *range(7, 0, -1)]
+
+
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.tuples(st.integers(1, 6), st.booleans()), min_size=1, max_size=6), st.integers(0, 3))
 def test_any_trajectories_survive_the_replay(trajectories, delay):
@@ -195,11 +215,70 @@ def test_a_minari_dataset_is_read_by_its_id(log, tmp_path, monkeypatch):
     )
     with pytest.raises(ValueError, match="Row 3 of episode 2 of test/broken-v0: rewards must be finite"):
         load("test/broken-v0")
+    with pytest.raises(ValueError, match="Row 3 of episode 2 of test/broken-v0"):  # its own number
+        load(minari.load_dataset("test/broken-v0").filter_episodes(lambda episode: episode.id == 2))
     with pytest.raises(ValueError, match="test/log-v0 is of Pendulum-v1, and the task is Hopper-v5"):
         load("test/log-v0", env_id="Hopper-v5")
     with pytest.raises(ValueError, match=r"no dataset 'test/nothing-v0'.*test/log-v0"):
         monkeypatch.setattr(minari, "load_dataset", lambda *_, **__: (_ for _ in ()).throw(FileNotFoundError("none")))
         load("test/nothing-v0")
+
+
+def test_a_combined_minari_dataset_has_all_episodes(log, tmp_path, monkeypatch):
+    minari = pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    task = gym.Env()
+    task.observation_space, task.action_space = STATES, ACTIONS
+    first, second = (
+        load(write(tmp_path / "log.npz", log)),
+        load(write(tmp_path / "b.npz", make_log((3, 4), (True, True)))),
+    )
+    for name, data in (("mine/first-v0", first), ("mine/second-v0", second)):
+        write_dataset(data, name, task)
+    minari.combine_datasets([minari.load_dataset("mine/first-v0"), minari.load_dataset("mine/second-v0")], "both-v0")
+    same(load("both-v0"), load([first, second]))
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".hdf5"])
+def test_a_file_of_another_task_is_refused(suffix, log, tmp_path):
+    """Walker2d and HalfCheetah have the same shapes."""
+    path = write(tmp_path / f"log{suffix}", log | ({"env": np.array("Walker2d-v5")} if suffix == ".npz" else {}))
+    if suffix == ".hdf5":
+        with h5py.File(path, "a") as file:
+            file.attrs["env"] = "Walker2d-v5"
+    with pytest.raises(ValueError, match=rf"log{suffix} is of Walker2d-v5, and the task is HalfCheetah-v5; give"):
+        load(path, env_id="HalfCheetah-v5")
+    with pytest.warns(UserWarning, match="of Walker2d-v5, and the task is Walker2d-v4: versions may differ"):
+        load(path, env_id="Walker2d-v4")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        same(load(path, env_id="Walker2d-v5"), load(path))
+        load(write(tmp_path / f"silent{suffix}", log), env_id="HalfCheetah-v5")  # as D4RL's, it says nothing
+
+
+def test_tasks_without_a_version_differ_by_their_names(log, tmp_path):
+    path = write(tmp_path / "log.npz", log | {"env": np.array("Mine")})
+    with pytest.raises(ValueError, match="is of Mine, and the task is Yours"):
+        load(path, env_id="Yours")
+
+
+def test_a_written_file_names_its_task(log, tmp_path):
+    env = gym.make("Pendulum-v1")
+    data = Dataset(*(np.zeros(s, np.float32) for s in ((2, 3), (2, 1), 2)), *np.eye(2, dtype=bool), np.zeros((1, 3)))
+    write_dataset(data, tmp_path / "a.npz", env)
+    with pytest.raises(ValueError, match=r"a\.npz is of Pendulum-v1"):
+        load_dataset(tmp_path / "a.npz", env.observation_space, env.action_space, "Hopper-v5")
+
+
+def test_a_slow_file_shows_a_bar(log, tmp_path, monkeypatch, capsys):
+    path = write(tmp_path / "log.npz", log)
+    load(path, progress_bar=True)
+    assert capsys.readouterr().err == ""  # it took no second
+    monkeypatch.setattr(sources, "tqdm", lambda *args, **kwargs: tqdm(*args, **kwargs | {"delay": 0}))
+    load(path)
+    assert capsys.readouterr().err == ""
+    load(path, progress_bar=True)
+    assert "log.npz: 100%" in capsys.readouterr().err
 
 
 def test_several_sources_are_joined(log, tmp_path):
@@ -208,8 +287,12 @@ def test_several_sources_are_joined(log, tmp_path):
     assert joined.lengths.tolist() == [5, 1, 7] * 2 and len(joined.finals) == 6
 
 
+def twice(column):
+    return np.stack([column] * 2, axis=1)
+
+
 def broken(log, key, row, value):
-    log[key] = log[key].copy()
+    log[key] = np.array(log[key], np.float64)
     log[key][row] = value
     return log
 
@@ -227,11 +310,86 @@ def broken(log, key, row, value):
         (lambda log: {k: v for k, v in log.items() if k != "actions"}, "none of actions"),
         (lambda log: {{"timeouts": "dones"}.get(k, k): v for k, v in log.items()}, "'dones' do not say"),
         (lambda log: {k: v[:0] for k, v in log.items()}, "or are empty"),
+        (lambda log: broken(log, "rewards", 1, 1e300), "Row 1 of .*: rewards must be finite"),  # in float32
+        (lambda log: broken(log, "terminals", 3, np.nan), r"Row 3 of .*log\.npz: terminals must be 0 or 1, got nan"),
+        (lambda log: broken(log, "timeouts", 2, 7), "Row 2 of .*: timeouts must be 0 or 1, got 7"),
+        (lambda log: log | {"rewards": twice(log["rewards"])}, r"log\.npz has rewards of shape \(2,\), expected one"),
+        (lambda log: log | {"terminals": twice(log["terminals"])}, r"log\.npz has terminals of shape \(2,\)"),
+        (lambda log: log | {"actions": log["actions"].astype(str)}, "has actions of type <U"),
     ],
 )  # fmt: skip
 def test_what_is_no_log_of_the_task_is_refused(change, message, log, tmp_path):
     with pytest.raises(ValueError, match=message):
         load(write(tmp_path / "log.npz", change(log)))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: replace(d, states=np.where(np.arange(13)[:, None] == 3, np.nan, d.states)), "Row 3 of Dataset: obs"),
+        (lambda d: replace(d, actions=2 * d.actions), "the action is outside the bounds"),
+        (lambda d: replace(d, rewards=d.rewards[:-1]), "The columns of Dataset differ in length"),
+        (lambda d: replace(d, rewards=twice(d.rewards)), r"rewards of shape \(2,\)"),
+        (lambda d: replace(d, finals=d.finals[:2]), r"finals of shape \(2, 3\), expected .* \(3, 3\)"),
+        (lambda d: replace(d, ends=d.ends & (np.arange(13) < 12)), "the last step to be such an end"),
+        (lambda d: replace(d, terminated=~d.ends), "Row 0 of Dataset: the task ended, and the trajectory goes on"),
+    ],
+)
+def test_a_dataset_in_memory_is_checked_too(change, message, log, tmp_path):
+    data = load(write(tmp_path / "log.npz", log))
+    same(load(data), data)
+    with pytest.raises(ValueError, match=message):
+        load(change(data))
+
+
+def test_one_number_a_row_may_stand_in_a_column(log, tmp_path):
+    standing = {key: value[:, None] if value.ndim == 1 else value for key, value in log.items()}
+    same(load(write(tmp_path / "a.npz", standing)), load(write(tmp_path / "b.npz", log)))
+
+
+@pytest.mark.parametrize(
+    ("suffix", "damage"),
+    [
+        (".npz", lambda content: content[: len(content) // 2]),
+        (".npz", lambda content: b"no zip at all"),
+        (".npz", lambda content: b""),
+        (".npz", lambda content: content[:80] + bytes(40) + content[120:]),
+        (".hdf5", lambda content: content[: len(content) // 2]),
+        (".hdf5", lambda content: b"no HDF5 at all"),
+    ],
+)
+def test_a_damaged_file_is_named(suffix, damage, log, tmp_path):
+    path = write(tmp_path / f"log{suffix}", log)
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(ValueError, match=rf"log{suffix} cannot be read; it is damaged, or no {suffix} file"):
+        load(path)
+
+
+def test_pickled_columns_are_not_opened(log, tmp_path):
+    with pytest.raises(ValueError, match=r"log\.npz cannot be read.*allow_pickle=False"):
+        load(write(tmp_path / "log.npz", log | {"rewards": np.array([{}] * 13)}))
+    same(load(write(tmp_path / "a.npz", log | {"infos": np.array([{}] * 13)})), load(write(tmp_path / "b.npz", log)))
+
+
+def test_old_observations_are_no_states():
+    """What SB3's own SAC stores under delay; and the goals of a HER buffer would be lost in the same way."""
+    env = delayed(2)
+    model = SAC("MultiInputPolicy", env, buffer_size=50, learning_starts=100, device="cpu").learn(20)
+    with pytest.raises(ValueError, match="A DictReplayBuffer holds dicts, not the states of a task"):
+        load_dataset(model.replay_buffer, env.observation_space, env.action_space)
+
+
+def test_a_buffer_that_keeps_no_last_state_is_refused():
+    kwargs = {"optimize_memory_usage": True, "handle_timeout_termination": False}
+    buffer = ReplayBuffer(10, STATES, ACTIONS, device="cpu", **kwargs)
+    with pytest.raises(ValueError, match="optimize_memory_usage=True keeps neither the last state of an episode"):
+        load(buffer)
+
+
+@pytest.mark.parametrize("source", [3, None, [["a.npz", "b.npz"]], {}])
+def test_what_is_no_dataset_is_said(source):
+    with pytest.raises(ValueError, match="is no dataset; give the id of a Minari dataset"):
+        load(source)
 
 
 def test_no_file_and_no_step_are_said():

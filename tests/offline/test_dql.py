@@ -145,6 +145,21 @@ def test_eta_makes_it_climb_q():
     assert mean_action(20.0) > mean_action(0.0) + 0.3
 
 
+@pytest.mark.parametrize("lr_decay", [False, True])
+def test_the_rate_falls_to_0_by_a_cosine(lr_decay, monkeypatch, tmp_path):
+    rates = []
+    monkeypatch.setattr(
+        DQL, "_descend", lambda self, network, loss: rates.append(network.optimizer.param_groups[0]["lr"])
+    )
+    model = make(learning_rate=0.1, lr_decay=lr_decay)
+    for _ in range(2):  # a second training starts as high
+        model.learn_offline(demonstrations(2), 10)
+    expected = 0.05 * (1 + np.cos(np.pi * np.arange(10) / 10)) if lr_decay else np.full(10, 0.1)
+    np.testing.assert_allclose(rates, np.tile(expected.repeat(2), 2))  # of critics and actor
+    model.save(tmp_path / "dql.zip")
+    assert DQL.load(tmp_path / "dql.zip", device="cpu").lr_schedule(0.5) == pytest.approx(0.05 if lr_decay else 0.1)
+
+
 @pytest.mark.parametrize("delay", [None, 2])
 def test_it_learns_is_saved_and_repeats(delay, tmp_path):
     model = make(None if delay is None else delayed(delay), diffusion_kwargs={"ema_start": 2, "ema_every": 1})

@@ -1,4 +1,4 @@
-"""make train plays the run that it trained, whatever else is trained meanwhile."""
+"""make train plays the run that it trained, whatever else is trained meanwhile; make demo draws a shipped agent."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ esac
 """
 
 
-def make(folder: Path) -> subprocess.CompletedProcess[str]:
+def make(folder: Path, target: str = "train") -> subprocess.CompletedProcess[str]:
     python = folder / "python"
     python.write_text(PYTHON)
     python.chmod(0o755)
-    command = ["make", "-f", str(MAKEFILE), "-o", "install", "train", f"PY={python}", "PYTHON=none", "EPISODES=3"]
+    command = ["make", "-f", str(MAKEFILE), "-o", "install", target, f"PY={python}", "PYTHON=none", "EPISODES=3"]
     environ = {name: value for name, value in os.environ.items() if "MAKE" not in name}  # not those of `make test`
     return subprocess.run(command, cwd=folder, env=environ, capture_output=True, text=True, timeout=60)
 
@@ -48,3 +48,13 @@ def test_make_train_ends_with_a_training_that_failed(tmp_path: Path) -> None:
     (tmp_path / "broken").touch()
     assert make(tmp_path).returncode != 0
     assert "evaluate.py" not in (tmp_path / "calls").read_text()
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
+def test_make_demo_draws_an_agent_that_is_there(tmp_path: Path) -> None:
+    done = make(tmp_path, "demo")
+    assert done.returncode == 0, done.stderr
+    (call,) = (tmp_path / "calls").read_text().splitlines()
+    words = call.split()
+    assert words[0] == "scripts/enjoy.py" and (MAKEFILE.parent / words[1]).is_file()
+    assert "--beside-ignorant" in words and words[-2:] == ["--record", "demo.gif"]

@@ -17,6 +17,7 @@ from trained_run import ENV, PLANNER, train_here
 from sb3_said import SAID
 from sb3_said.files.archive import load_tree
 from sb3_said.offline import BC, DQL, IQL, REFERENCE_RETURNS, DQLConfig
+from sb3_said.offline.learning import GradientStepBar
 from sb3_said.zoo import evaluate, train, tune
 from sb3_said.zoo.manager import ALGOS
 from sb3_said.zoo.offline import OfflineExperimentManager
@@ -115,15 +116,55 @@ def test_a_killed_run_ends_as_one_that_was_not(
     np.testing.assert_array_equal(rows[0]["results"][0], rows[1]["results"][0])
 
 
-def test_other_data_is_not_gone_on_with(log: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("algo", ["bc", "dql"])
+def test_other_data_is_not_gone_on_with(algo: str, log: Path, tmp_path: Path) -> None:
     mine = tmp_path / "mine.npz"
     mine.write_bytes(log.read_bytes())
-    train_here(tmp_path, " ".join(command("bc", mine, steps=5)), *BC_PARAMS)
-    with np.load(mine) as columns:
-        changed = {**columns, "actions": -columns["actions"]}
-    np.savez(mine, **changed)
-    with pytest.raises(ValueError, match="of a training on other data; resume with the dataset of the run"):
-        train.main(["--resume", str(run_of(tmp_path, "bc")), "-n", "10"])
+    train_here(tmp_path, " ".join(command(algo, mine, steps=2)), "-params", "batch_size:16")
+    with np.load(log) as file:
+        columns = dict(file)
+    changes: list[dict[str, Any]] = [
+        {"actions": -columns["actions"]},
+        {"rewards": columns["rewards"] + 1},
+        {name: 1.5 * columns[name] for name in ("observations", "next_observations")},
+        {"terminals": columns["timeouts"], "timeouts": columns["terminals"]},
+    ]
+    for change in changes:
+        np.savez(mine, **columns | change)
+        with pytest.raises(ValueError, match="of a training on other data; resume with the dataset of the run"):
+            train.main(["--resume", str(run_of(tmp_path, algo)), "-n", "4"])
+    np.savez(mine, **columns)
+    train.main(["--resume", str(run_of(tmp_path, algo)), "-n", "4"])
+    assert load_run(run_of(tmp_path, algo), device="cpu").model.num_timesteps == 4
+
+
+@pytest.mark.parametrize("algo", ["bc", "said"])
+def test_a_resume_says_that_its_data_is_gone_or_damaged(algo: str, log: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "mine.npz"
+    mine.write_bytes(log.read_bytes())
+    train_here(tmp_path, " ".join(command(algo, mine, steps=2)), *(BC_PARAMS if algo == "bc" else SAID_PARAMS))
+    mine.write_bytes(log.read_bytes()[:500])
+    with pytest.raises(SystemExit, match=r"train: error: .*mine\.npz cannot be read; it is damaged"):
+        train.main(["--resume", str(run_of(tmp_path, algo)), "-n", "4"])
+    mine.unlink()
+    with pytest.raises(SystemExit, match=r"train: error: There is no dataset .*mine\.npz"):
+        train.main(["--resume", str(run_of(tmp_path, algo)), "-n", "4"])
+
+
+@pytest.mark.parametrize("algo", ["bc", "said"])
+def test_the_bar_counts_gradient_steps(
+    algo: str, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bars, close = [], GradientStepBar._on_training_end
+
+    def note(bar: GradientStepBar) -> None:
+        bars.append((bar.pbar.n, bar.pbar.total))
+        close(bar)
+
+    monkeypatch.setattr(GradientStepBar, "_on_training_end", note)
+    params = BC_PARAMS if algo == "bc" else SAID_PARAMS
+    train_here(tmp_path, " ".join(command(algo, log, steps=4)), "-P", *params, "n_envs:2")
+    assert bars == [(4, 4)] and "/8" not in capsys.readouterr().out
 
 
 def test_evaluate_has_scores_and_the_best_agent_beside_the_last(
@@ -218,6 +259,7 @@ def test_the_paper_preset_has_the_papers_pairs_by_the_datasets_name() -> None:
     assert varies["planner_kwargs"]["mask"] == "random"
     kinds = {
         "mujoco/hopper/medium-v0": "medium",
+        "/home/expert/replay/hopper-medium.npz": "medium",
         "mujoco/hopper/expert-v0": "medium-expert",
         "Replay.npz": "medium-replay",
     }
@@ -254,5 +296,23 @@ def test_dql_has_the_papers_settings_and_learns_here(log: Path, tmp_path: Path) 
     model = load_run(run_of(tmp_path, "dql"), device="cpu").model
     assert isinstance(model, DQL) and (model.augment_state, model.delay_reconciled_critic) == (True, False)
     assert model.policy.config == DQLConfig() and model._n_updates == 3
-    made = preset_overrides(config_file("dql", True), "paper", "Hopper-v5", 4)
-    assert made == {"n_timesteps": 2_000_000}
+    assert "train/critic_loss" in (run_of(tmp_path, "dql") / "progress.csv").read_text()  # a run shorter than a row
+    norms = {  # Table 4: medium, medium-replay, medium-expert
+        "HalfCheetah-v5": (9.0, 2.0, 7.0),
+        "Hopper-v5": (9.0, 4.0, 5.0),
+        "Walker2d-v5": (1.0, 4.0, 5.0),
+    }
+    for preset, more in (("cpu", {}), ("paper", {"n_timesteps": 2_000_000, "lr_decay": True, "relabelled_ages": 0.0})):
+        for env_id, of_task in norms.items():
+            for name, norm in zip(("medium", "medium-replay", "medium-expert"), of_task, strict=True):
+                made = preset_overrides(config_file("dql", True), preset, env_id, 4, None, [f"data/x-{name}-v2.hdf5"])
+                assert made == {"diffusion_kwargs": {"max_grad_norm": norm}, **more}
+        assert preset_overrides(config_file("dql", True), preset, "Mine-v0", 4, None, ["expert.npz"]) == more
+
+
+def test_a_python_file_of_settings_has_no_presets(tmp_path: Path) -> None:
+    file = tmp_path / "settings.py"
+    file.write_text("hyperparams = {}")
+    assert preset_overrides(file, "cpu", "Hopper-v5", 4) == {}
+    with pytest.raises(ValueError, match="no preset 'paper'"):
+        preset_overrides(file, "paper", "Hopper-v5", 4)

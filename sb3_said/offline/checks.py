@@ -1,0 +1,109 @@
+"""What a log must be like before anything learns from it."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_said.delays.space import scale_action
+
+ACTION_TOLERANCE = 1e-3  # of half the range: what float32 and a tanh leave beyond the bounds
+
+#: observations, actions, rewards, terminated, ends and next_observations of N rows; ``scaled`` for actions in [-1, 1]
+Columns = dict[str, np.ndarray]
+
+
+def check_task(name: str, given: str | None, env_id: str | None) -> None:
+    """Refuse data of another task, and warn of another version of it.
+
+    :param given: id of the task that the data is of, None where it does not say
+    :param env_id: id of the task to learn, None where it has none
+    :raises ValueError: naming both
+    """
+    if given is None or env_id is None or given == env_id:
+        return
+    message = f"{name} is of {given}, and the task is {env_id}"
+    if len({task.rpartition("-v")[0] or task for task in (given, env_id)}) > 1:
+        raise ValueError(f"{message}; give a dataset of that task.")
+    warnings.warn(f"{message}: versions may differ in rewards and observations.", stacklevel=3)
+
+
+def check_lengths(name: str, columns: Mapping[str, np.ndarray]) -> None:
+    """:raises ValueError: for columns of different lengths, and for empty ones"""
+    sizes = {key: value.shape[:1] for key, value in columns.items()}
+    if len(set(sizes.values())) > 1 or sizes["rewards"] in ((), (0,)):
+        raise ValueError(f"The columns of {name} differ in length, or are empty: {sizes}.")
+
+
+def flags(name: str, key: str, values: Any) -> np.ndarray:
+    """Return a column of flags: (N,) bool.
+
+    :raises ValueError: for several numbers in a row, and for others than 0 and 1, such as NaN; it names the row
+    """
+    column = _one_a_row(name, key, values)
+    _refuse(name, (column != 0) & (column != 1), f"{key} must be 0 or 1", column)
+    return column.astype(bool)
+
+
+def checked(name: str, columns: Columns, state_space: spaces.Box, action_space: spaces.Box) -> dict[str, np.ndarray]:
+    """Return what a ``Dataset`` is made of, actions scaled.
+
+    :param name: of the source, for errors
+    :raises ValueError: for what is no log of the task; it names the row
+    """
+    box = spaces.Box(-1.0, 1.0, action_space.shape) if "scaled" in columns else action_space
+    columns = {**columns, "rewards": _one_a_row(name, "rewards", columns["rewards"])}
+    shapes = {"observations": state_space.shape, "actions": box.shape, "rewards": ()}
+    floats = {}
+    for key, expected in (shapes | {"next_observations": state_space.shape}).items():
+        values = _numbers(name, key, columns[key])
+        if values.shape[1:] != expected:
+            raise ValueError(
+                f"{name} has {key} of shape {values.shape[1:]}, and the task {expected}: it is of another task."
+            )
+        with np.errstate(over="ignore"):  # refused with a reason next
+            floats[key] = np.asarray(values, np.float32)
+        is_finite = np.isfinite(floats[key]).reshape(len(values), -1).all(axis=1)
+        _refuse(name, ~is_finite, f"{key} must be finite", values)
+    states, next_states, actions = (floats[key] for key in ("observations", "next_observations", "actions"))
+    ends, terminated = columns["ends"], columns["terminated"]
+    half = (box.high - box.low) / 2
+    outside = np.any(np.abs(actions - (box.low + box.high) / 2) > half * (1 + ACTION_TOLERANCE), axis=1)
+    _refuse(name, outside, f"the action is outside the bounds {box}", actions)
+    _refuse(name, terminated & ~ends, "the task ended, and the trajectory goes on", terminated)
+    follows = np.all(np.isclose(next_states[:-1], states[1:], rtol=1e-3, atol=1e-3), axis=1) | ends[:-1]
+    _refuse(name, ~follows, "its next observation is not that of the next row, and no flag ends it", next_states)
+    return {
+        "states": states,
+        "actions": scale_action(actions, box).astype(np.float32),
+        "rewards": floats["rewards"],
+        "terminated": terminated,
+        "ends": ends,
+        "finals": next_states[ends],
+    }
+
+
+def _numbers(name: str, key: str, values: Any) -> np.ndarray:
+    column = np.asarray(values)
+    if column.dtype.kind not in "biuf":
+        raise ValueError(f"{name} has {key} of type {column.dtype}, expected numbers.")
+    return column
+
+
+def _one_a_row(name: str, key: str, values: Any) -> np.ndarray:
+    """Return a column (N,) or (N, 1) as (N,)."""
+    column = _numbers(name, key, values)
+    if column.size != len(column):
+        raise ValueError(f"{name} has {key} of shape {column.shape[1:]}, expected one number in each row.")
+    return column.reshape(-1)
+
+
+def _refuse(name: str, bad: Any, why: str, values: np.ndarray) -> None:
+    """:raises ValueError: where a row is bad; it names the first, and how many there are"""
+    if (rows := np.flatnonzero(bad)).size:
+        more = f" ({rows.size} rows like this)" if rows.size > 1 else ""
+        raise ValueError(f"Row {rows[0]} of {name}: {why}, got {values[rows[0]]}{more}.")

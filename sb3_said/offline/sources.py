@@ -1,0 +1,182 @@
+"""Where logs come from: files, replay buffers and Minari, each read into columns of the same names."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from stable_baselines3.common.buffers import ReplayBuffer
+from tqdm.auto import tqdm
+
+from sb3_said.offline.checks import Columns, check_lengths, flags
+from sb3_said.replay.buffer import DelayedReplayBuffer
+
+#: Names that files give to a column. D4RL's come first, then Minari's and SB3's.
+COLUMNS = {
+    "observations": ("observations", "states", "obs"),
+    "actions": ("actions",),
+    "rewards": ("rewards",),
+    "terminated": ("terminals", "terminations", "terminated"),
+    "truncated": ("timeouts", "truncations", "truncated"),
+    "next_observations": ("next_observations", "next_states", "next_obs"),
+}
+TASK = "env"  # entry of an .npz, entry or attribute of an HDF5 file: id of the task, where it says
+READ = {TASK, *(name for names in COLUMNS.values() for name in names)}
+
+
+class Log(NamedTuple):
+    """What was found in one place."""
+
+    name: str
+    task: str | None
+    """id of the task that it is of, where it says"""
+    parts: list[tuple[str, Columns]]
+    """each with its name, for errors"""
+
+
+def read_file(path: Path, progress_bar: bool) -> Log:
+    """Read an ``.npz`` or HDF5 file.
+
+    :param progress_bar: show one over the columns, where they take more than a second
+    :raises FileNotFoundError: where there is none
+    :raises ValueError: for a damaged file, or one without a column that is needed
+    """
+    if not path.exists():
+        raise FileNotFoundError(f"There is no dataset {path}.")
+    if path.suffix != ".npz":
+        try:
+            import h5py
+        except ImportError as error:
+            raise ImportError(f'{path} needs h5py: pip install "sb3_said[offline]".') from error
+
+    def read(file: Any, names: Iterable[str]) -> dict[str, Any]:
+        bar = tqdm(names, desc=path.name, unit="column", disable=not progress_bar, delay=1.0)
+        return {name: file[name][()] if name in READ else None for name in bar}  # errors name the others
+
+    try:
+        if path.suffix == ".npz":
+            with np.load(path, allow_pickle=False) as file:
+                given = read(file, file.files)
+        else:
+            with h5py.File(path, "r") as file:
+                given = read(file, [name for name in file if isinstance(file[name], h5py.Dataset)])
+                given |= {TASK: file.attrs[TASK]} if TASK in file.attrs else {}
+    except Exception as error:  # NumPy, zipfile and HDF5 raise many kinds
+        raise ValueError(f"{path} cannot be read; it is damaged, or no {path.suffix} file: {error}") from error
+    task = given.pop(TASK, None)
+    task = task.decode(errors="replace") if isinstance(task, bytes) else task
+    name = os.fspath(path)
+    return Log(name, task if isinstance(task, str) else None, [(name, _of_columns(name, given))])
+
+
+def _of_columns(name: str, given: Mapping[str, Any]) -> Columns:
+    """Return the columns under our names, with the trajectories' ends.
+
+    Without next observations, the state after a time limit is unknown: that step's state ends the trajectory instead.
+    """
+    found = {ours: next((n for n in names if n in given), None) for ours, names in COLUMNS.items()}
+    if lacking := [COLUMNS[key] for key in COLUMNS if found[key] is None and key != "next_observations"]:
+        hint = " 'dones' do not say whether the task or a time limit ended an episode." if "dones" in given else ""
+        raise ValueError(
+            f"{name} has the columns {', '.join(sorted(given))} and none of {' or '.join(lacking[0])}.{hint}"
+        )
+    columns = {key: np.asarray(given[theirs]) for key, theirs in found.items() if theirs is not None}
+    check_lengths(name, columns)
+    for key in ("terminated", "truncated"):
+        columns[key] = flags(name, str(found[key]), columns[key])
+    columns["ends"] = columns["terminated"] | columns.pop("truncated")
+    columns["ends"][-1] = True
+    if "next_observations" not in columns:
+        states = columns["observations"]
+        columns["next_observations"] = np.concatenate([states[1:], states[-1:]])
+        unknown = columns["ends"] & ~columns["terminated"]
+        columns["ends"] |= np.append(unknown[1:], False)  # where it was the only step, nothing is left of it
+        columns = {key: value[~unknown] for key, value in columns.items()}
+    return columns
+
+
+def read_buffer(buffer: ReplayBuffer) -> Log:
+    """Read a replay buffer: of each parallel environment, oldest step first.
+
+    :raises ValueError: for one that does not hold the states, or not how episodes ended
+    """
+    name = type(buffer).__name__
+    if isinstance(buffer.observations, dict):
+        raise ValueError(
+            f"A {name} holds dicts, not the states of a task: a delayed observation is old, and a goal is no part of "
+            "it. Give a DelayedReplayBuffer, as DelayedSAC fills it, or a ReplayBuffer of a task with Box observations."
+        )
+    if buffer.optimize_memory_usage:
+        raise ValueError(
+            f"A {name} with optimize_memory_usage=True keeps neither the last state of an episode nor whether a time "
+            "limit ended it; collect with optimize_memory_usage=False."
+        )
+    size = buffer.size()
+    rows = (buffer.pos - size + np.arange(size)) % buffer.buffer_size
+    parts = []
+    for env in range(buffer.n_envs):
+        envs = np.full(size, env)
+        states = buffer.observations[rows, envs]
+        if isinstance(buffer, DelayedReplayBuffer):
+            next_states, breaks = buffer._successors(rows, envs)[0], buffer.ends[rows, envs]
+        else:
+            next_states = buffer.next_observations[rows, envs]
+            breaks = np.append(np.any(next_states[:-1] != states[1:], axis=1), True)
+        dones, timeouts = buffer.dones[rows, envs] > 0, buffer.timeouts[rows, envs] > 0
+        ends = breaks | dones
+        ends[-1:] = True
+        columns = {
+            "observations": states,
+            "actions": buffer.actions[rows, envs],
+            "rewards": buffer.rewards[rows, envs],
+            "terminated": dones & ~timeouts,
+            "ends": ends,
+            "next_observations": next_states,
+            "scaled": np.ones(size, bool),
+        }
+        parts.append((f"environment {env} of {name}", columns))
+    return Log(name, None, parts)
+
+
+def read_minari(source: Any, progress_bar: bool) -> Log:
+    """Read a Minari dataset, by its id or as it was loaded; an id that is not local is downloaded.
+
+    :raises ValueError: where there is none, or observations are no vectors
+    """
+    try:
+        import minari
+    except ImportError as error:
+        raise ImportError(f'The dataset {source} needs Minari: pip install "sb3_said[offline]".') from error
+    if isinstance(source, (str, os.PathLike)):
+        try:
+            source = minari.load_dataset(os.fspath(source), download=True)
+        except Exception as error:  # Minari and the hub below it raise many kinds
+            local = ", ".join(sorted(minari.list_local_datasets())) or "none"
+            raise ValueError(
+                f"There is no dataset {source!r}: it is no .npz or .hdf5 file, and Minari says {error!s:.200} "
+                f"Local Minari datasets: {local}."
+            ) from error
+    name, spec = source.spec.dataset_id, source.env_spec
+    episodes = tqdm(source.iterate_episodes(), desc=name, total=source.total_episodes, disable=not progress_bar)
+    parts = [_of_episode(f"episode {episode.id} of {name}", episode) for episode in episodes]
+    return Log(name, None if spec is None else spec.id, parts)
+
+
+def _of_episode(name: str, episode: Any) -> tuple[str, Columns]:
+    if not isinstance(episode.observations, np.ndarray):
+        raise ValueError(f"{name} has observations of kind {type(episode.observations).__name__}, expected vectors.")
+    length = len(episode.rewards)
+    ends = np.zeros(length, bool)
+    ends[-1:] = True
+    columns = {
+        "observations": episode.observations[:length],
+        "actions": episode.actions,
+        "rewards": episode.rewards,
+        "terminated": flags(name, "terminations", episode.terminations),
+        "ends": ends,
+        "next_observations": episode.observations[1 : length + 1],
+    }
+    return name, columns
