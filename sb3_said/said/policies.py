@@ -151,7 +151,7 @@ class SAIDPolicy(DelayedSACPolicy):
         """Let one of them answer ``predict`` from now on, or two; a file keeps it.
 
         :param who: ``"planner"``, ``"expert"``, ``"student"``, or ``"both"``: the expert where the observation is
-            young, the planner where it is older
+            young, the planner where it is older, and until an observation arrives that an action has led to
         :param expert_up_to: with ``"both"``, the largest age at which the expert answers, in control steps
         :raises ValueError: for another name, for a planner that is not trained, for no student, or for an
             ``expert_up_to`` outside 0..max_delay - 1
@@ -269,9 +269,16 @@ class SAIDPolicy(DelayedSACPolicy):
         return actions
 
     def _is_experts(self, observation: PyTorchObs, who: Answer) -> th.Tensor:
-        """Tell for which observations the expert decides: (B,) bool."""
+        """Tell for which observations the expert decides: (B,) bool.
+
+        Where both do, the planner begins: while s_0 is all that has arrived, the age still grows, and a planner that
+        takes over from the expert amid its first steps falls (measured, results/agents.md).
+        """
         if who == "both" and isinstance(observation, dict):
-            return observation[KEYS[2]][:, 0] < self.expert_ages
+            history, age = observation[KEYS[1]], observation[KEYS[2]][:, 0].long()  # (B, D, act_dim), (B,)
+            rows, steps = th.arange(len(age), device=age.device), (self.max_delay - 1 - age).clamp(min=0)
+            led_there = history[rows, steps]  # a_{t-d-1}, zeros where s_{t-d} is s_0
+            return (age < self.expert_ages) & led_there.ne(0).any(1)
         n = len(observation[KEYS[0]] if isinstance(observation, dict) else observation)
         return th.full((n,), who == "expert", device=self.device)
 

@@ -394,10 +394,13 @@ def test_a_plan_that_is_not_finite_is_refused(trained, monkeypatch):
 
 
 def test_of_both_the_expert_answers_young_observations_and_the_planner_old_ones(saved):
+    """Until an observation arrives that an action has led to, the age still grows, and the planner answers, too."""
     model = SAID.load(saved, device="cpu")
-    obs = observe()
-    young = obs["delay"][:, 0] <= 1
-    assert young.any() and not young.all() and model.policy.expert_up_to is None
+    parts = [observe(env=delayed(delay=delay, max_delay=2)) for delay in (1, 2)]
+    obs = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    np.testing.assert_array_equal(obs["delay"][:, 0], [0, 1, 1, 1, 1, 1, 1, 0, 1, 2, 2, 2, 2, 2])
+    young = np.array([0, 0, 1, 1, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0], bool)  # and not s_0
+    assert model.policy.expert_up_to is None
     answers = {}
     for who in ("planner", "expert"):
         with model.policy.answering(who):
