@@ -185,6 +185,11 @@ def learn_values(model: SAID, updates: int) -> None:
     model.policy.values.load_state_dict(learner.values.state_dict())
 
 
+def preset_of(model: SAID, args: argparse.Namespace) -> PlannerConfig:
+    """Return the settings of SAID's row, whatever the run's trial chose."""
+    return replace(model.policy.planner.config, **WAYS["default"], **args.planner_kwargs)
+
+
 def players(model: SAID, rows: list[str], args: argparse.Namespace) -> Iterator[tuple[str, int | None, Any]]:
     """Yield rows, their seed and who plays them; trains what is missing.
 
@@ -197,7 +202,7 @@ def players(model: SAID, rows: list[str], args: argparse.Namespace) -> Iterator[
     if "expert, average/None" in rows:
         with policy.answering("expert"):
             yield "expert, average", None, model
-    preset = replace(policy.planner.config, **WAYS["default"], **args.planner_kwargs)  # whatever the run's trial chose
+    preset = preset_of(model, args)
     together: list[InpaintingPlanner] = []
     for seed in args.seeds:
         if "together/None" in rows or any(f"{row}/{seed}" in rows for row in LEARNED):
@@ -253,12 +258,13 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     args = p.parse_args(argv)
     th.set_num_threads(args.num_threads)
     model = open_run(args.run) if args.log is None else open_with_log(args.run, args.log)
-    settings: dict[str, Any] = {key: getattr(args, key) for key in ("updates", "episodes", "planner_kwargs")}
+    settings: dict[str, Any] = {key: getattr(args, key) for key in ("updates", "episodes", "eval_seed")}
     settings["steps"] = model.num_timesteps
+    settings |= {f"planner_{name}": value for name, value in preset_of(model, args).weight_settings().items()}
     document = json.loads(args.json.read_text()) if args.json.exists() else {**settings, "returns": {}}
-    document.setdefault("planner_kwargs", {})  # older files have the run's settings
-    if given := {key: document[key] for key in settings if document[key] != settings[key]}:
-        p.error(f"{args.json} holds results of {given}, but {settings} was asked for: give another --json.")
+    if given := {key: document.get(key) for key in settings if document.get(key) != settings[key]}:
+        asked = {key: settings[key] for key in given}
+        p.error(f"{args.json} holds results of {given}, but {asked} was asked for: give another --json.")
     returns: dict[str, dict[str, list[float]]] = document["returns"]
 
     keys = [f"{row}/{seed}" for row in args.rows for seed in ([None] if row in ALONE else args.seeds)]

@@ -1,5 +1,6 @@
 """The agents of agents/, as whoever clones the project meets them."""
 
+import hashlib
 import json
 from pathlib import Path
 
@@ -39,3 +40,4 @@ def test_an_agent_loads_by_its_file_alone_and_acts_as_it_did(name: str) -> None:
     assert f'load("{name}")' in card and "library_name: stable-baselines3" in card and "mean_reward" in card
     # Machines round differently; by another plan it would act differently by far more.
     np.testing.assert_allclose(first_actions(file), FIRST_ACTIONS[name], atol=0.05)
+    assert hashlib.sha256(file.read_bytes()).hexdigest() in card  # its returns are of this file

@@ -176,11 +176,11 @@ def who_answers(model: Any) -> str:
     if not isinstance(model, SAID):
         return type(model).__name__
     who, config = model.policy.who_answers, model.policy.planner.config
-    told = f"both, the expert up to age {model.policy.expert_up_to}" if who == "both" else who
     if who not in ("planner", "both"):
-        return told
-    how = f"{config.sampling_steps} denoising steps at temperature {config.temperature:g}"
-    return f"{told}; the planner in {how}" + (f", {config.n_candidates} candidates" if config.temperature else "")
+        return who
+    how = f"in {config.sampling_steps} denoising step{'s' * (config.sampling_steps > 1)}"
+    how += f" at temperature {config.temperature:g}" + f", {config.n_candidates} candidates" * bool(config.temperature)
+    return f"the expert up to age {model.policy.expert_up_to}, else the planner {how}" if who == "both" else f"{who} {how}"
 
 
 def made_by(record: Record, model: Any = None) -> str:

@@ -109,14 +109,16 @@ def test_other_settings_of_the_planner_need_another_file(run, tmp_path, monkeypa
     script.main(words)
     with pytest.raises(SystemExit):
         script.main([*words, "--planner-kwargs", "end_time_probability=1.0"])
-    assert "'planner_kwargs': {}" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "holds results of {'planner_end_time_probability': 0.25}, but" in error
     other = [
         *words[:-1],
         str(tmp_path / "one_step.json"),
         "--planner-kwargs",
         "horizon=3,decision_weight=1.0,lr_schedule=constant",
     ]
-    assert script.main(other)["planner_kwargs"] == {"horizon": 3, "decision_weight": 1.0, "lr_schedule": "constant"}
+    found = script.main(other)
+    assert (found["planner_horizon"], found["planner_lr_schedule"], found["eval_seed"]) == (3, "constant", 10_000)
     assert trained[1] == replace(trained[0], horizon=3, decision_weight=1.0, lr_schedule="constant")
     with pytest.raises(SystemExit):
         script.main([*other[:-1], "horizon"])

@@ -47,7 +47,7 @@ def test_an_agent_handed_on_and_its_card(run: Path, tmp_path: Path, capsys: pyte
     assert f"| 0 | {np.mean(right[0]):.1f} [" in text and "| UniformDelay(0, 2), age +1 |" in text
     assert "| control period | 40 ms |" in text
     assert f"| SHA-256 | `{hashlib.sha256(agent.read_bytes()).hexdigest()}` |" in text
-    assert "denoising steps at temperature" in text
+    assert "denoising step" in text
 
 
 def test_returns_of_another_file_are_refused(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
