@@ -180,7 +180,9 @@ def who_answers(model: Any) -> str:
         return who
     how = f"in {config.sampling_steps} denoising step{'s' * (config.sampling_steps > 1)}"
     how += f" at temperature {config.temperature:g}" + f", {config.n_candidates} candidates" * bool(config.temperature)
-    return f"the expert up to age {model.policy.expert_up_to}, else the planner {how}" if who == "both" else f"{who} {how}"
+    return (
+        f"the expert up to age {model.policy.expert_up_to}, else the planner {how}" if who == "both" else f"{who} {how}"
+    )
 
 
 def made_by(record: Record, model: Any = None) -> str:
