@@ -68,7 +68,7 @@ def test_it_learns_a_linear_system_and_its_behaviour():
     windows = source.sample(2_000, L, generator)
     normalizer.fit_moves(windows)
     guess = make_guess()
-    fit_first_guess(guess, source, normalizer, PlannerConfig(weight_factor=0.0), 2_000, generator)
+    fit_first_guess(guess, source, normalizer, PlannerConfig(weight_factor=0.0), 1_000, generator)
     reaches = windows.valid[:, D]
     states, actions = windows.states[reaches], windows.actions[reaches]
     n = len(states)
