@@ -165,8 +165,7 @@ def confidence_interval(
     n = len(units)
     if units.size == 0 or not np.all(np.isfinite(units)):
         raise ValueError(f"An interval needs at least one value and only finite ones, got {units}.")
-    if not 0 < confidence < 1:
-        raise ValueError(f"confidence is a probability strictly between 0 and 1, got {confidence}.")
+    _check_confidence(confidence)
 
     def of_units(rows: np.ndarray, axis: int = -1) -> Any:
         """Return the statistic of the values of units, whose numbers are on the last axis: (..., m) -> (...)."""
@@ -210,8 +209,7 @@ def stratified_interval(
     values = np.asarray(returns, dtype=np.float64)
     if values.ndim != 2 or values.size == 0 or not np.all(np.isfinite(values)):
         raise ValueError(f"Expected finite returns of the shape (n_seeds, n_episodes), got {values}.")
-    if not 0 < confidence < 1:
-        raise ValueError(f"confidence is a probability strictly between 0 and 1, got {confidence}.")
+    _check_confidence(confidence)
     n_seeds, n_episodes = values.shape
     rng = np.random.default_rng(seed)
     means = np.zeros(n_resamples)
@@ -220,6 +218,11 @@ def stratified_interval(
         means += values[drawn, rng.integers(n_episodes, size=(n_resamples, n_episodes))].mean(1) / n_seeds
     low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
     return Interval(float(values.mean()), float(low), float(high), confidence, values.size, "stratified bootstrap")
+
+
+def _check_confidence(confidence: float) -> None:
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence is a probability strictly between 0 and 1, got {confidence}.")
 
 
 def _without_nan(value: Any) -> Any:

@@ -253,20 +253,26 @@ class SAIDPolicy(DelayedSACPolicy):
         if not deterministic and who != "both":
             return self._plan(observation).action if who == "planner" else super()._predict(observation)
         is_experts = self._is_experts(observation, who)  # (B,)
-        if self._at_once and self.planner.config.temperature == 0:
-            groups = [rows for rows in (is_experts.nonzero()[:, 0], (~is_experts).nonzero()[:, 0]) if len(rows)]
-        else:
+        if not (self._at_once and self.planner.config.temperature == 0):
             # Each row alone: products of another batch size round differently, and can change the candidate chosen
-            groups = list(th.arange(len(is_experts)).split(1))
+            rows = zip(rows_of(observation), is_experts, strict=True)
+            return th.cat([self._decide(row, bool(is_one), deterministic) for row, is_one in rows])
         actions = th.empty(len(is_experts), self.planner.act_dim, device=self.device)
-        for rows in groups:
-            part = {k: x[rows] for k, x in observation.items()} if isinstance(observation, dict) else observation[rows]
-            actions[rows] = (
-                super()._predict(part, deterministic)
-                if is_experts[rows[0]]
-                else self._plan(part, repeats=deterministic).action
-            )
+        for is_one in (True, False):
+            if (of_one := is_experts == is_one).any():
+                part: PyTorchObs
+                if isinstance(observation, dict):
+                    part = {key: x[of_one] for key, x in observation.items()}
+                else:
+                    part = observation[of_one]
+                actions[of_one] = self._decide(part, is_one, deterministic)
         return actions
+
+    def _decide(self, observation: PyTorchObs, is_experts: bool, deterministic: bool) -> th.Tensor:
+        """Let the expert or the planner decide for all rows: (B, act_dim)."""
+        if is_experts:
+            return super()._predict(observation, deterministic)
+        return self._plan(observation, repeats=deterministic).action
 
     def _is_experts(self, observation: PyTorchObs, who: Answer) -> th.Tensor:
         """Tell for which observations the expert decides: (B,) bool.

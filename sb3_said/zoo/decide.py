@@ -10,7 +10,7 @@ from sb3_said import SAID
 from sb3_said.files.normalization import normalization_file
 from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.zoo.arguments import TRUST, explained, make_parser
-from sb3_said.zoo.runs import ANSWERS, find_agent
+from sb3_said.zoo.runs import ANSWERS, find_agent, find_normalization
 
 EPILOG = f"""\
 examples:
@@ -60,7 +60,8 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(argv)
     given = {name: getattr(args, name) for name in SAMPLING_SETTINGS if getattr(args, name) is not None}
     settings: dict[str, Any] = {name: None if value == "none" else value for name, value in given.items()}
-    changes = bool(settings) or args.answer is not None or args.expert_up_to is not None
+    sets_answer = args.answer is not None or args.expert_up_to is not None
+    changes = bool(settings) or sets_answer
     with explained(parser):
         if changes and args.output is None:
             raise ValueError("-o is missing: name the file of the agent with its new settings.")
@@ -70,7 +71,7 @@ def main(argv: list[str] | None = None) -> None:
             raise ValueError("-o is missing: name the file of the compact agent.")
         model = load_said(args.agent)
         model.set_planner(**settings)
-        if args.answer is not None or args.expert_up_to is not None:
+        if sets_answer:
             model.set_answer(args.answer or model.policy.who_answers, args.expert_up_to)
     config = model.policy.planner.config
     for name in SAMPLING_SETTINGS:
@@ -80,8 +81,7 @@ def main(argv: list[str] | None = None) -> None:
     if not model.policy.planner_is_trained:
         print("The planner of this agent is not trained yet.")
     up_to = f": the expert up to age {model.policy.expert_up_to}" if model.policy.who_answers == "both" else ""
-    is_new = args.answer is not None or args.expert_up_to is not None
-    print(f"{'answers':14} {model.policy.who_answers}{up_to}{'  (new)' * is_new}")
+    print(f"{'answers':14} {model.policy.who_answers}{up_to}{'  (new)' * sets_answer}")
     if args.output is not None:
         keep_normalization(args.agent, args.output)
         model.save(args.output, compact=args.compact)
@@ -90,10 +90,7 @@ def main(argv: list[str] | None = None) -> None:
 
 def keep_normalization(agent: Path, output: Path) -> None:
     """Write the statistics of a run with ``VecNormalize`` beside its new file, too."""
-    file, record = find_agent(agent)
-    sources = [file] if record is None else [file, file.with_name(record.agent_name)]
-    found = next((path for path in map(normalization_file, sources) if path.is_file()), None)
-    target = normalization_file(output)
+    found, target = find_normalization(*find_agent(agent)), normalization_file(output)
     if found is not None and not (target.exists() and target.samefile(found)):
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(found, target)

@@ -172,6 +172,17 @@ def find_agent(path: Path) -> tuple[Path, Record | None]:
     raise ValueError(f"{path} has no finished agent: neither {names[0]} nor {names[1]}.")
 
 
+def find_normalization(file: Path, record: Record | None) -> Path | None:
+    """Return where an agent's statistics of ``VecNormalize`` are, None without.
+
+    :param file: of the agent; this and the next as :func:`find_agent` returns them
+    """
+    agents = [file]
+    if record is not None:  # rl_zoo3's checkpoints (--save-freq) have none of their own
+        agents.append(file.with_name(record.agent_name))
+    return next((path for path in map(normalization_file, agents) if path.is_file()), None)
+
+
 def delay_name(process: DelayProcess) -> int | str:
     """Return the number of a fixed delay, and any other process as text."""
     return process.delay if isinstance(process, FixedDelay) else str(process)
@@ -263,13 +274,10 @@ def _check_spaces(model: BaseAlgorithm, env: gym.Env[Any, Any], file: Path) -> N
 def _load_normalize(
     file: Path, record: Record | None, make_env: Callable[[], gym.Env[Any, Any]]
 ) -> Callable[[Observation], Observation] | None:
-    beside = [normalization_file(file)]
-    if record is not None:  # rl_zoo3's checkpoints (--save-freq) have none of their own
-        beside.append(normalization_file(file.with_name(record.agent_name)))
-    found = next((path for path in beside if path.is_file()), None)
+    found = find_normalization(file, record)
     if found is None:
         if record is not None and record.hyperparams.get("normalize"):
-            raise ValueError(f"{file} reads normalised observations, but {beside[0]} is missing.")
+            raise ValueError(f"{file} reads normalised observations, but {normalization_file(file)} is missing.")
         return None
     statistics = load_normalization(found, DummyVecEnv([make_env]))
     statistics.close()
