@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -19,7 +19,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_said.offline.learning import OfflineAlgorithm
-from sb3_said.sac.policies import DelayedSACPolicy, rows_of, seed_of
+from sb3_said.sac.policies import DelayedSACPolicy, rows_of, seed_of, settings_of
 
 
 @dataclass(frozen=True)
@@ -169,10 +169,7 @@ class DQLPolicy(DelayedSACPolicy):
         diffusion_kwargs: dict[str, Any] | None = None,
         **policy_kwargs: Any,
     ):
-        names, given = [field.name for field in fields(DQLConfig)], diffusion_kwargs or {}
-        if unknown := sorted(set(given) - set(names)):
-            raise ValueError(f"DQL has no setting {', '.join(unknown)}; it has {', '.join(names)}.")
-        self.config = DQLConfig(**given)
+        self.config: DQLConfig = settings_of(DQLConfig, diffusion_kwargs, "DQL")
         critics: dict[str, Any] = {"net_arch": [self.config.hidden] * 3, "activation_fn": nn.Mish}
         super().__init__(observation_space, action_space, lr_schedule, **(critics | policy_kwargs))
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+import math
+from dataclasses import asdict, dataclass
+from numbers import Integral, Real
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -43,8 +45,16 @@ class IQLConfig:
     """for each of the planner's (ours: the planner has few where it learns within hours; the paper has one)"""
 
     def __post_init__(self) -> None:
-        if not 0.5 <= self.expectile < 1.0:
-            raise ValueError(f"expectile is {self.expectile}, expected 0.5 (the mean) up to, not with, 1.")
+        for name in ("hidden", "batch_size", "updates"):
+            if not isinstance(value := getattr(self, name), Integral) or value < 1:
+                raise ValueError(f"{name} is {value!r}, expected a whole number, at least 1.")
+        for name, fits, expected in (
+            ("expectile", lambda x: 0.5 <= x < 1, "0.5 (the mean) up to, not with, 1"),
+            ("learning_rate", lambda x: 0 < x < math.inf, "a number above 0"),
+            ("target_rate", lambda x: 0 < x <= 1, "a number above 0 and at most 1"),
+        ):
+            if not isinstance(value := getattr(self, name), Real) or not fits(value):
+                raise ValueError(f"{name} is {value!r}, expected {expected}.")
 
 
 class ImplicitValues(nn.Module):
@@ -155,13 +165,22 @@ class IQL:
     def state_dict(self) -> dict[str, Any]:
         """Return all that goes on with the training needs, but the data."""
         return {
+            "config": asdict(self.values.config),
             "values": self.values.state_dict(),
             "optimizer": self.optimizer.state_dict()["state"],
             "generator": self.generator.get_state(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from what :meth:`state_dict` returned."""
+        """Go on from what :meth:`state_dict` returned.
+
+        :raises ValueError: when that training had other settings, so that the end would be neither's
+        """
+        if (saved := state["config"]) != (own := asdict(self.values.config)):
+            raise ValueError(
+                f"V(s) was learned with iql_kwargs {saved} and is to go on with {own}; give the old ones, or start a "
+                "new training."
+            )
         self.values.load_state_dict(state["values"])
         self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": state["optimizer"]})
         self.generator.set_state(state["generator"])

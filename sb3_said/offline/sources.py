@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -101,6 +102,8 @@ def _of_columns(name: str, given: Mapping[str, Any]) -> Columns:
 def read_buffer(buffer: ReplayBuffer) -> Log:
     """Read a replay buffer: of each parallel environment, oldest step first.
 
+    Without ``handle_timeout_termination``, a warning says that dones are read as terminal states.
+
     :raises ValueError: for one that does not hold the states, or not how episodes ended
     """
     name = type(buffer).__name__
@@ -115,6 +118,13 @@ def read_buffer(buffer: ReplayBuffer) -> Log:
             "limit ended it; collect with optimize_memory_usage=False."
         )
     size = buffer.size()
+    if not buffer.handle_timeout_termination and (n_dones := int(buffer.dones[:size].sum())):
+        warnings.warn(
+            f"A {name} with handle_timeout_termination=False does not know which dones were time limits: all {n_dones} "
+            "are read as terminal states, after which nothing is earned. Where the task has a time limit, collect with "
+            "handle_timeout_termination=True.",
+            stacklevel=4,  # where the dataset was asked for
+        )
     rows = (buffer.pos - size + np.arange(size)) % buffer.buffer_size
     parts = []
     for env in range(buffer.n_envs):
@@ -144,7 +154,7 @@ def read_buffer(buffer: ReplayBuffer) -> Log:
 def read_minari(source: Any, progress_bar: bool) -> Log:
     """Read a Minari dataset, by its id or as it was loaded; an id that is not local is downloaded.
 
-    :raises ValueError: where there is none, or observations are no vectors
+    :raises ValueError: where there is none, for a damaged one, and where observations are no vectors
     """
     try:
         import minari
@@ -161,7 +171,12 @@ def read_minari(source: Any, progress_bar: bool) -> Log:
             ) from error
     name, spec = source.spec.dataset_id, source.env_spec
     episodes = tqdm(source.iterate_episodes(), desc=name, total=source.total_episodes, disable=not progress_bar)
-    parts = [_of_episode(f"episode {episode.id} of {name}", episode) for episode in episodes]
+    try:
+        parts = [_of_episode(f"episode {episode.id} of {name}", episode) for episode in episodes]
+    except (KeyError, OSError, RuntimeError) as error:  # of HDF5, which does not name the file
+        raise ValueError(
+            f"The dataset {name} in {source.spec.data_path} cannot be read; it is damaged: {error}"
+        ) from error
     return Log(name, None if spec is None else spec.id, parts)
 
 

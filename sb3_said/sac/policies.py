@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -281,3 +282,17 @@ def _check_delayed(arrays: dict[str, np.ndarray], max_delay: int) -> None:
             f"state_known runs from {known.min():g} to {known.max():g}, expected 1 where a state of state_history is "
             "known and 0 elsewhere."
         )
+
+
+def settings_of(cls: Any, given: dict[str, Any] | None, whose: str) -> Any:
+    """Return settings from the keyword arguments that a constructor was given for them.
+
+    :param cls: a dataclass
+    :param given: some of its fields; None for none
+    :param whose: settings they are, for the error
+    :raises ValueError: for a field that it does not have, and as the class does
+    """
+    names, given = [field.name for field in fields(cls)], given or {}
+    if unknown := sorted(set(given) - set(names)):
+        raise ValueError(f"{whose} has no setting {', '.join(unknown)}; it has {', '.join(names)}.")
+    return cls(**given)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import fields, replace
+from dataclasses import asdict, replace
 from itertools import product
 from typing import Any, Literal, get_args
 
@@ -14,12 +14,12 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_said.delays.space import KEYS, STATE_KEYS, UNDELAYED, check_spaces, has_state_history
-from sb3_said.offline.iql import ImplicitValues
+from sb3_said.offline.iql import ImplicitValues, IQLConfig
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner.graphs import EAGER_CALLS
 from sb3_said.planner.planner import Plan
 from sb3_said.planner.selection import choose
-from sb3_said.sac.policies import DelayedSACPolicy, rows_of, seed_of
+from sb3_said.sac.policies import DelayedSACPolicy, rows_of, seed_of, settings_of
 from sb3_said.said.student import Student
 
 Answer = Literal["planner", "expert", "both", "student"]
@@ -36,10 +36,11 @@ class SAIDPolicy(DelayedSACPolicy):
     :param value: who values planned states: ``"critics"``, the expert's, by min Q(s, a); or ``"iql"``, a V(s) of its
         own (see :class:`~sb3_said.offline.ImplicitValues`), which scores the states after the decision where
         ``scored_states`` is ``"decision"``: no action shows in V of the present that all candidates share
+    :param iql_kwargs: fields of :class:`~sb3_said.offline.IQLConfig`, of that V(s)
     :param student_width: of the hidden layers of a :class:`~sb3_said.said.student.Student`; None for none
     :param policy_kwargs: of :class:`~sb3_said.sac.DelayedSACPolicy`
-    :raises ValueError: for an unknown planner setting, a delayed task whose critics do not read the true state, or a
-        ``state_history`` that the planner is not trained to read
+    :raises ValueError: for an unknown setting of planner or V(s), a delayed task whose critics do not read the true
+        state, or a ``state_history`` that the planner is not trained to read
     """
 
     planner_updates: th.Tensor
@@ -53,6 +54,7 @@ class SAIDPolicy(DelayedSACPolicy):
         *,
         planner_kwargs: dict[str, Any] | None = None,
         value: Value = "critics",
+        iql_kwargs: dict[str, Any] | None = None,
         student_width: int | None = None,
         **policy_kwargs: Any,
     ):
@@ -62,14 +64,13 @@ class SAIDPolicy(DelayedSACPolicy):
                 "SAID scores planned states with the expert's critics, which must read true states; "
                 "leave delay_reconciled_critic=True."
             )
-        names, given = [field.name for field in fields(PlannerConfig)], planner_kwargs or {}
-        if unknown := sorted(set(given) - set(names)):
-            raise ValueError(f"The planner has no setting {', '.join(unknown)}; it has {', '.join(names)}.")
+        config = settings_of(PlannerConfig, planner_kwargs, "The planner")
+        self.iql_config: IQLConfig = settings_of(IQLConfig, iql_kwargs, "IQL")
         self.register_buffer("planner_updates", th.zeros(()))
         self.register_buffer("expert_preferred", th.zeros(()))  # part of the ages, from 0 on, at which it answers
         self.values: ImplicitValues | None = None
         with th.random.fork_rng(devices=[]):  # the expert learns as it would without a planner
-            self.make_planner(PlannerConfig(**given))
+            self.make_planner(config)
             self.set_value(value)
             self.make_student(student_width)
         if has_state_history(observation_space) and self.planner.config.extra_state_probability == 0:
@@ -100,7 +101,8 @@ class SAIDPolicy(DelayedSACPolicy):
         self.values = None
         if value == "iql":
             state_space, _ = check_spaces(self.observation_space, self.action_space)
-            self.values = ImplicitValues(state_space.shape[0], self.action_space.shape[0]).to(self.device)  # type: ignore[index]  # a Box has a shape
+            sizes = state_space.shape[0], self.action_space.shape[0]  # type: ignore[index]  # a Box has a shape
+            self.values = ImplicitValues(*sizes, self.iql_config).to(self.device)
             self.planner.config = self._scored(self.planner.config)
 
     def _scored(self, config: PlannerConfig) -> PlannerConfig:
@@ -372,5 +374,6 @@ class SAIDPolicy(DelayedSACPolicy):
             **super()._get_constructor_parameters(),
             "planner_kwargs": self.planner.config.to_dict(),
             "value": "critics" if self.values is None else "iql",
+            "iql_kwargs": asdict(self.iql_config),
             "student_width": None if self.student is None else self.student.width,
         }

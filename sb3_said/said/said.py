@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -19,11 +19,12 @@ from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from sb3_said.delays.space import ages_of, has_state_history
 from sb3_said.files.archive import PathOrFile
-from sb3_said.offline import IQL, ImplicitValues, OfflineAlgorithm, load_dataset
+from sb3_said.offline import IQL, ImplicitValues, IQLConfig, OfflineAlgorithm, load_dataset
 from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.planner.values import returns_to_go
 from sb3_said.sac import StableSAC
+from sb3_said.sac.policies import settings_of
 from sb3_said.said.callbacks import PlannerTrainingCallback
 from sb3_said.said.policies import Answer, SAIDPolicy, Value
 from sb3_said.said.student import Distillation, distill
@@ -63,10 +64,13 @@ class SAID(OfflineAlgorithm, StableSAC):
         default :data:`~sb3_said.said.trial.WAYS`, or none where ``planner_kwargs`` has such settings
     :param value: who scores the planner's candidates: ``"critics"``, the expert's, by min Q(s, a); or ``"iql"``, a
         V(s) that is learned beside the planner by implicit Q-learning, which is what offline learning has
+    :param iql_kwargs: fields of :class:`~sb3_said.offline.IQLConfig`, how that V(s) is learned, such as
+        ``{"expectile": 0.9}``; the attribute has all of them
     :param student_width: of the hidden layers of the student that :meth:`distill` trains; None before
     :param sac_kwargs: every other argument of :class:`~sb3_said.sac.StableSAC`, the expert, and of SB3's ``SAC``
-    :raises ValueError: as ``DelayedSAC`` does, for planner settings outside their range, and for a ``state_history``
-        in the observations that the planner is not trained to read or that ``VecNormalize`` leaves unscaled
+    :raises ValueError: as ``DelayedSAC`` does, for settings of planner or V(s) outside their range, and for a
+        ``state_history`` in the observations that the planner is not trained to read or that ``VecNormalize`` leaves
+        unscaled
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": SAIDPolicy, "MultiInputPolicy": SAIDPolicy}
@@ -87,6 +91,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         planner_trial_episodes: int = 10,
         planner_ways: dict[str, dict[str, Any]] | None = None,
         value: Value = "critics",
+        iql_kwargs: dict[str, Any] | None = None,
         student_width: int | None = None,
         **sac_kwargs: Any,
     ):
@@ -107,6 +112,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         self.planner_trial_episodes = planner_trial_episodes
         self.planner_ways = ways_of(planner_ways, self._given_planner_kwargs)
         self.value = value
+        self.iql_kwargs = asdict(settings_of(IQLConfig, iql_kwargs, "IQL"))
         self.student_width = student_width
         self._planner_trained_at = 0  # num_timesteps of the last planner training
         super().__init__(policy, env, learning_rate, **sac_kwargs)
@@ -135,8 +141,8 @@ class SAID(OfflineAlgorithm, StableSAC):
                 warnings.warn(str(error), stacklevel=3)
 
     def _policy_flags(self) -> dict[str, Any]:
-        student = {"student_width": self.student_width}
-        return {**super()._policy_flags(), "planner_kwargs": self.planner_kwargs, "value": self.value, **student}
+        own = {name: getattr(self, name) for name in ("planner_kwargs", "value", "iql_kwargs", "student_width")}
+        return {**super()._policy_flags(), **own}
 
     def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:
         """Keep this agent's own planner where the given one was never trained and has other settings."""
@@ -359,7 +365,8 @@ class SAID(OfflineAlgorithm, StableSAC):
             data = replace(data, states=normalized[0], finals=normalized[1])
         with th.random.fork_rng(devices=[]):
             th.manual_seed(self.seed or 0)
-            values = ImplicitValues(data.states.shape[1], data.actions.shape[1]).to(self.device)
+            sizes = data.states.shape[1], data.actions.shape[1]
+            values = ImplicitValues(*sizes, self.policy.iql_config).to(self.device)
         return IQL(values, data, self.gamma, self.seed or 0)
 
     def learn_offline(  # type: ignore[override]

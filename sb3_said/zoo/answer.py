@@ -16,6 +16,7 @@ from sb3_said.files.atomic import replacing
 from sb3_said.files.normalization import normalization_file, save_normalization
 from sb3_said.zoo.stopping import Stopping
 
+BEST_NAME = "best_model.zip"  # of the agent that did best in training, as SB3's EvalCallback names it
 EXPERT_FOLDER = "expert"  # in the run's: what EvalCallback wrote while the expert learned
 
 
@@ -58,7 +59,7 @@ def evaluate_answer(model: SAID, like: EvalCallback, folder: Path, stopping: Sto
     model.logger.record("eval/answer_mean_ep_length", float(np.mean(lengths)))
     model.logger.dump(model.num_timesteps)
     if mean >= best:
-        save_with_normalization(model, folder / "best_model.zip")
+        save_with_normalization(model, folder / BEST_NAME)
 
 
 def save_with_normalization(model: SAID, path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -76,10 +77,22 @@ def explained(parser: argparse.ArgumentParser) -> Iterator[None]:
         yield
     except ValueError as error:
         parser.error(str(error))
-    except ImportError as error:
+    except (ImportError, OSError) as error:
         parser.exit(1, f"{error}\n")
     except KeyboardInterrupt:
         parser.exit(130, "\nInterrupted. Give the same command again to go on.\n")
+
+
+@contextmanager
+def ending_training(*errors: type[Exception]) -> Iterator[None]:
+    """End the program with the message of an error that a user can mend, once the options are read.
+
+    :param errors: of these kinds; all others are raised
+    """
+    try:
+        yield
+    except errors as error:
+        sys.exit(f"sb3-said train: error: {error}")
 
 
 def read_delay(words: list[str]) -> Delay:

@@ -20,12 +20,13 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_said import SAID, DelayedSAC, PlannerTrainingCallback, StableSAC
 from sb3_said.files.agents import SafeSaveMixin
+from sb3_said.files.archive import SavedFileError
 from sb3_said.files.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback, restore_training
 from sb3_said.files.normalization import load_normalization, normalization_file, save_normalization
 from sb3_said.offline import BC, DQL, OfflineAlgorithm
 from sb3_said.offline.datasets import is_file
-from sb3_said.zoo.answer import EXPERT_FOLDER, evaluate_answer
-from sb3_said.zoo.arguments import Delay, largest_delay
+from sb3_said.zoo.answer import BEST_NAME, EXPERT_FOLDER, evaluate_answer
+from sb3_said.zoo.arguments import Delay, ending_training, largest_delay
 from sb3_said.zoo.folder import claim_folder, drop_undone_episodes, hold_folder, log_suffix
 from sb3_said.zoo.presets import config_file, preset_overrides
 from sb3_said.zoo.record import EVALUATED, Record, make_wrapper, options_of, with_delay
@@ -49,10 +50,11 @@ for _name, (_class, _) in ALGORITHMS.items():
 
 
 def with_given(settings: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
-    """Return settings with those of ``-params`` in their place; of ``planner_kwargs``, each by itself."""
-    before, now = settings.get("planner_kwargs"), given.get("planner_kwargs")
-    if isinstance(before, dict) and isinstance(now, dict):
-        given = {**given, "planner_kwargs": {**before, **now}}
+    """Return settings with those of ``-params`` in their place; of planner and V(s), each by itself."""
+    for name in ("planner_kwargs", "iql_kwargs"):
+        before, now = settings.get(name), given.get(name)
+        if isinstance(before, dict) and isinstance(now, dict):
+            given = {**given, name: {**before, **now}}
     return {**settings, **given}
 
 
@@ -216,7 +218,7 @@ class DelayedExperimentManager(ExperimentManager):
         self._set_evaluation()
         if self.evaluation is not None:
             self.evaluation.callback_on_new_best = SaveNormalization(
-                normalization_file(Path(str(self.evaluation.best_model_save_path), "best_model.zip")),
+                normalization_file(Path(str(self.evaluation.best_model_save_path), BEST_NAME)),
                 self.evaluation.callback_on_new_best,
             )
         self._add_checkpoints()
@@ -238,10 +240,12 @@ class DelayedExperimentManager(ExperimentManager):
         """Train, from the last checkpoint if there is one. Ctrl-C, SIGTERM or SIGHUP ends it with a checkpoint.
 
         :param model: newly made
+        :raises SystemExit: for a checkpoint that is damaged, or of another training
         """
         resumes = self.checkpoint.exists()
         if resumes:
-            restore_training(model, self.checkpoint, CallbackList(self.callbacks))  # type: ignore[arg-type]
+            with ending_training(SavedFileError):
+                restore_training(model, self.checkpoint, CallbackList(self.callbacks))  # type: ignore[arg-type]
             print(f"Resuming {self.save_path} at step {model.num_timesteps}")
             drop_undone_episodes(self.folder, model.num_timesteps // model.n_envs)
         taken = model.num_timesteps if resumes else 0  # learn() counts the steps of an agent given with -i anew
@@ -250,7 +254,7 @@ class DelayedExperimentManager(ExperimentManager):
         log_interval = {-1: self.LOG_INTERVAL}.get(self.log_interval, max(self.log_interval, 0) or None)
         how = {"callback": self.callbacks, "log_interval": log_interval, "reset_num_timesteps": not resumes}
         try:
-            with self.stopping.listening():
+            with self.stopping.listening(), ending_training(SavedFileError):  # of the planner's checkpoint
                 self._learn(model, max(self.n_timesteps - taken, 0), **how)
                 if self.stopping.is_asked:
                     raise KeyboardInterrupt

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -13,6 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_said.files.checkpoint import TrainingCheckpointCallback
 from sb3_said.offline import OfflineAlgorithm
 from sb3_said.said import SAID
+from sb3_said.zoo.arguments import ending_training
 from sb3_said.zoo.manager import DelayedExperimentManager, Run
 
 
@@ -42,10 +42,8 @@ class OfflineExperimentManager(DelayedExperimentManager):
         made = super().setup_experiment()
         assert made is not None and isinstance(made[0], OfflineAlgorithm)  # no -optimize, as the constructor saw to
         model = made[0]
-        try:
+        with ending_training(ValueError, ImportError, OSError):
             model.take_dataset([*self.run.dataset], self.show_progress)
-        except (ValueError, ImportError, OSError) as error:
-            sys.exit(f"sb3-said train: error: {error}")
         replay = model.replay_buffer
         print(f"Learning from {replay.size():,} logged steps; no environment is stepped but in evaluations.")
         return made

@@ -28,7 +28,7 @@ from sb3_said.evaluation.rollout import Observation, Rollout, rollout
 from sb3_said.files.archive import SavedFileError, load_metadata
 from sb3_said.files.normalization import load_normalization, normalization_file
 from sb3_said.said.policies import Answer
-from sb3_said.zoo.answer import EXPERT_FOLDER
+from sb3_said.zoo.answer import BEST_NAME, EXPERT_FOLDER
 from sb3_said.zoo.arguments import Delay, largest_delay
 from sb3_said.zoo.manager import ALGORITHMS, ALGOS
 from sb3_said.zoo.record import RECORD_NAME, WRAPPER, Record, import_packages, make_wrapper
@@ -165,7 +165,7 @@ def find_agent(path: Path) -> tuple[Path, Record | None]:
     if runs and str(path) not in runs:
         raise ValueError(f"{path} is not a run folder: it holds the runs {', '.join(runs)}.")
     record = Record.read(path)
-    names = record.agent_name, "best_model.zip"
+    names = record.agent_name, BEST_NAME
     for name in names:
         if (path / name).is_file():
             return path / name, record

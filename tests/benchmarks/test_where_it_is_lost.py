@@ -27,7 +27,7 @@ from sb3_said.zoo.runs import load_run
 def files(tmp_path_factory):
     """A planner that can be told states, an actor without delay, and a log."""
     folder = tmp_path_factory.mktemp("lost")
-    kwargs = {"planner_kwargs": TINY_PLANNER | {"extra_state_probability": 0.5}, "planner_gradient_steps": 30}
+    kwargs = {"planner_kwargs": TINY_PLANNER | {"extra_state_probability": 0.5}, "planner_gradient_steps": 10}
     said = write_run(folder / "said-v0", SAID, (0, 2), 90, **kwargs)
     actor = write_run(folder / "actor-v0", DelayedSAC, 0, 60)
     collect.main([str(said), "--steps", "80", "--n-envs", "1", "-o", str(folder / "log.npz"), "--device", "cpu"])

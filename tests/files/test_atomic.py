@@ -52,16 +52,25 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
 
 
-# Writes 1 MB of its own letter to one file, over and over, when the starting line comes.
-WRITER = """
-import sys
-from sb3_said.files.archive import load_tree, save_tree
+# Three processes, each of which writes 1 MB of its own letter to one file, over and over. They are forked after the
+# imports, which take a second each, and so begin together.
+WRITERS = """
+import multiprocessing, sys
 import numpy as np
-sys.stdin.readline()
-for _ in range(20):
-    save_tree(sys.argv[1], np.full(1_000_000, ord(sys.argv[2]), np.uint8))
-    read = load_tree(sys.argv[1])
-    assert (read == read[0]).all()
+from sb3_said.files.archive import load_tree, save_tree
+
+def write(letter):
+    for _ in range(20):
+        save_tree(sys.argv[1], np.full(1_000_000, letter, np.uint8))
+        read = load_tree(sys.argv[1])
+        assert (read == read[0]).all()
+
+writers = [multiprocessing.get_context("fork").Process(target=write, args=(letter,)) for letter in b"abc"]
+for writer in writers:
+    writer.start()
+for writer in writers:
+    writer.join()
+sys.exit(str([writer.exitcode for writer in writers]) if any(writer.exitcode for writer in writers) else 0)
 """
 
 
@@ -72,11 +81,7 @@ def start(code, *words, **how):
 
 def test_several_processes_may_write_one_file_and_a_reader_sees_it_whole(tmp_path):
     path = tmp_path / "tree"
-    writers = [start(WRITER, path, letter, stdin=subprocess.PIPE) for letter in "abc"]
-    for writer in writers:
-        writer.stdin.write("go\n")
-        writer.stdin.flush()
-    assert [writer.wait(120) for writer in writers] == [0, 0, 0]
+    assert start(WRITERS, path).wait(120) == 0
     assert list(tmp_path.iterdir()) == [path]
 
 

@@ -219,6 +219,9 @@ def test_a_minari_dataset_is_read_by_its_id(log, tmp_path, monkeypatch):
         load(minari.load_dataset("test/broken-v0").filter_episodes(lambda episode: episode.id == 2))
     with pytest.raises(ValueError, match="test/log-v0 is of Pendulum-v1, and the task is Hopper-v5"):
         load("test/log-v0", env_id="Hopper-v5")
+    (tmp_path / "test/broken-v0/data/main_data.hdf5").write_bytes(b"no HDF5 at all")
+    with pytest.raises(ValueError, match=r"The dataset test/broken-v0 in .*data cannot be read; it is damaged"):
+        load("test/broken-v0")
     with pytest.raises(ValueError, match=r"no dataset 'test/nothing-v0'.*test/log-v0"):
         monkeypatch.setattr(minari, "load_dataset", lambda *_, **__: (_ for _ in ()).throw(FileNotFoundError("none")))
         load("test/nothing-v0")
@@ -384,6 +387,22 @@ def test_a_buffer_that_keeps_no_last_state_is_refused():
     buffer = ReplayBuffer(10, STATES, ACTIONS, device="cpu", **kwargs)
     with pytest.raises(ValueError, match="optimize_memory_usage=True keeps neither the last state of an episode"):
         load(buffer)
+
+
+@pytest.mark.parametrize(("done", "knows"), [(True, False), (True, True), (False, False)])
+def test_a_buffer_that_knows_no_time_limits_says_that_dones_are_read_as_terminals(done, knows):
+    buffer = ReplayBuffer(10, STATES, ACTIONS, device="cpu", handle_timeout_termination=knows)
+    states = np.eye(5, 3, dtype=np.float32)
+    for i in range(4):
+        infos = [{"TimeLimit.truncated": i == 1}]
+        buffer.add(states[i], states[i + 1], np.zeros((1, 2)), np.zeros(1), np.array([done and i == 1]), infos)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        data = load(buffer)
+    assert data.ends.nonzero()[0].tolist() == ([1, 3] if done else [3])
+    assert data.terminated.nonzero()[0].tolist() == ([1] if done and not knows else [])
+    told = [("does not know which dones were time limits" in str(w.message), w.filename) for w in caught]
+    assert told == [(True, __file__)] * (done and not knows)
 
 
 @pytest.mark.parametrize("source", [3, None, [["a.npz", "b.npz"]], {}])

@@ -1,6 +1,7 @@
 """Implicit Q-learning against closed forms: expectiles, a bandit, and a chain solved by hand."""
 
 import copy
+import math
 
 import numpy as np
 import pytest
@@ -65,9 +66,9 @@ def test_values_reach_back_through_time_and_end_with_the_task_alone(terminates):
 def test_a_resumed_training_ends_as_one_that_never_stopped():
     data = dataset(np.eye(3), np.zeros((3, 1)), np.ones(3), [0, 0, 1], [0, 0, 1], np.zeros((1, 3)))
 
-    def make():
+    def make(**changes):
         th.manual_seed(0)
-        return IQL(ImplicitValues(3, 1, IQLConfig(hidden=8)), data, 0.9)
+        return IQL(ImplicitValues(3, 1, IQLConfig(hidden=8, **changes)), data, 0.9)
 
     whole, first = make(), make()
     for _ in range(6):
@@ -79,9 +80,22 @@ def test_a_resumed_training_ends_as_one_that_never_stopped():
     for _ in range(3):
         second.step()
     th.testing.assert_close(second.values.state_dict(), whole.values.state_dict(), rtol=0, atol=0)
+    with pytest.raises(ValueError, match=r"'expectile': 0\.7, .* and is to go on with .*'expectile': 0\.9, "):
+        make(expectile=0.9).load_state_dict(saved)
 
 
-def test_settings_that_make_no_expectile_are_refused():
-    for tau in (0.4, 1.0):
-        with pytest.raises(ValueError, match="expectile is"):
-            IQLConfig(expectile=tau)
+@pytest.mark.parametrize(
+    ("name", "values", "expected"),
+    [
+        ("expectile", (0.4, 1.0, math.nan, "high"), r"0\.5 \(the mean\) up to, not with, 1"),
+        ("learning_rate", (0.0, math.inf, math.nan), "a number above 0"),
+        ("target_rate", (0.0, 1.1), "a number above 0 and at most 1"),
+        ("hidden", (0, 8.0), "a whole number, at least 1"),
+        ("batch_size", (0,), "a whole number, at least 1"),
+        ("updates", (0,), "a whole number, at least 1"),
+    ],
+)
+def test_settings_out_of_range_are_refused(name, values, expected):
+    for value in values:
+        with pytest.raises(ValueError, match=f"{name} is {value!r}, expected {expected}"):
+            IQLConfig(**{name: value})

@@ -1,6 +1,6 @@
 """SAID from logs: no environment, values of its own, and the same files, callbacks and resumes as online."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -12,7 +12,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_said import SAID, PlannerConfig
 from sb3_said.files.archive import SavedFileError
-from sb3_said.offline import Dataset
+from sb3_said.offline import IQL, Dataset, IQLConfig
+from sb3_said.said.policies import SAIDPolicy
 from sb3_said.said.training import PlannerTraining
 
 
@@ -58,6 +59,33 @@ def test_the_planner_answers_after_learning_from_logs(learned, tmp_path):
     with th.no_grad():
         assert th.equal(loaded.policy.value(states, None), learned.policy.value(states, None))
     assert loaded.value == "iql"
+
+
+def test_v_is_learned_as_told_and_a_file_keeps_how(tmp_path):
+    given = {"expectile": 0.9, "hidden": 16, "updates": 3}
+    model = make(iql_kwargs=given)
+    assert model.policy.values is None  # online the critics score
+    steps, step = [], IQL.step
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(IQL, "step", lambda iql: steps.append(iql.values.config) or step(iql))
+        learn(model, steps=2)
+    assert steps == [IQLConfig(**given)] * 6 and model.policy.values.config == steps[0]
+    model.save(tmp_path / "agent.zip")
+    model.policy.save(tmp_path / "policy.zip")
+    loaded = SAID.load(tmp_path / "agent.zip", env=model.env, device="cpu")
+    alone = SAIDPolicy.load(tmp_path / "policy.zip", device="cpu")
+    assert loaded.iql_kwargs == model.iql_kwargs == asdict(steps[0])
+    for policy in (loaded.policy, alone):
+        assert policy.values.config == steps[0]
+        th.testing.assert_close(policy.values.state_dict(), model.policy.values.state_dict(), rtol=0, atol=0)
+    assert learn(loaded, steps=1).policy.values.config == steps[0]  # it learns on as before
+
+
+def test_no_other_settings_of_v_are_taken():
+    with pytest.raises(ValueError, match=r"IQL has no setting tau; it has expectile, hidden, .*updates"):
+        make(iql_kwargs={"tau": 0.9})
+    with pytest.raises(ValueError, match=r"expectile is 0\.3, expected"):
+        make(iql_kwargs={"expectile": 0.3})
 
 
 def test_all_of_a_log_is_learned_from():

@@ -3,7 +3,7 @@
 import inspect
 import warnings
 import zipfile
-from dataclasses import fields
+from dataclasses import asdict, fields
 
 import gymnasium as gym
 import numpy as np
@@ -21,6 +21,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_said import SAID, PlannerConfig, StableSAC
 from sb3_said.delays import TotalDelay, UniformDelay
+from sb3_said.offline import IQLConfig
 
 # ---------------------------------------------------------------------------------------------------- the expert
 
@@ -188,6 +189,7 @@ def test_every_argument_has_a_default_and_is_an_attribute():
         "planner_trial_episodes": 3,
         "planner_ways": {"eager": {"temperature": 0.1}},
         "value": "iql",
+        "iql_kwargs": asdict(IQLConfig(expectile=0.8)),
         "student_width": 16,
     }
     assert [p.name for p in own] == list(given) and all(p.default is not p.empty for p in own)

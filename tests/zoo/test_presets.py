@@ -16,7 +16,7 @@ from stable_baselines3 import SAC
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC, PlannerConfig
 from sb3_said.zoo.arguments import Delay
-from sb3_said.zoo.manager import ALGORITHMS, DelayedExperimentManager, Run
+from sb3_said.zoo.manager import ALGORITHMS, DelayedExperimentManager, Run, with_given
 from sb3_said.zoo.presets import PRESETS, config_file, preset_overrides
 
 TASKS = ("Ant-v5", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5")
@@ -129,6 +129,12 @@ def test_what_is_given_for_the_planner_leaves_the_rest_of_the_preset(tmp_path: P
     assert PlannerConfig(**settings["planner_kwargs"]) == PlannerConfig.paper(4, 0.7)
     given = {"planner_kwargs": {"temperature": 0.7}, "gamma": 0.9}
     assert merged_settings("said", "cpu", "Hopper-v5", 4, tmp_path, given)["planner_kwargs"] == {"temperature": 0.7}
+    before = {"planner_kwargs": {"depth": 2}, "iql_kwargs": {"expectile": 0.9}, "gamma": 0.99}  # as a resumed run's
+    assert with_given(before, given | {"iql_kwargs": {"updates": 1}}) == {
+        "planner_kwargs": {"depth": 2, "temperature": 0.7},
+        "iql_kwargs": {"expectile": 0.9, "updates": 1},
+        "gamma": 0.9,
+    }
 
 
 def test_the_papers_expert_is_sadr_as_published(tmp_path: Path) -> None:

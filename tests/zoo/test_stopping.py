@@ -15,7 +15,7 @@ import pytest
 
 pytest.importorskip("rl_zoo3")
 
-from trained_run import ENV, PLANNER
+from trained_run import ENV, NETWORKS, PLANNER
 
 from sb3_said import SAID
 from sb3_said.files.archive import load_tree
@@ -29,9 +29,10 @@ COMMAND = f"--algo said --env {ENV} --delay 2 --seed 3 --num-threads 1 --eval-fr
 PARAMS = [
     "learning_starts:50",
     "buffer_size:400",
-    "planner_gradient_steps:20",
+    "planner_gradient_steps:10",
     "planner_trial_episodes:1",
     f"planner_kwargs:{PLANNER}",
+    NETWORKS,
 ]
 
 

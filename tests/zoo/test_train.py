@@ -18,7 +18,7 @@ import yaml
 pytest.importorskip("rl_zoo3")
 
 from kill import Killed
-from trained_run import train_here
+from trained_run import NETWORKS, train_here
 
 from sb3_said import SAID, DelayedSAC
 from sb3_said.files.archive import load_tree
@@ -35,9 +35,9 @@ ENV = "InvertedPendulum-v5"
 
 
 def arguments(folder: Path) -> list[str]:
-    base = f"--algo said --env {ENV} --delay 2 --preset smoke -n 400 --seed 3 --num-threads 1 --verbose 0"
-    options = "--eval-freq 200 --checkpoint-freq 100 --device cpu"
-    params = ["learning_starts:150", "planner_gradient_steps:20", TINY_PLANNER]
+    base = f"--algo said --env {ENV} --delay 2 --preset smoke -n 200 --seed 3 --num-threads 1 --verbose 0"
+    options = "--eval-freq 100 --eval-episodes 2 --checkpoint-freq 50 --device cpu"
+    params = ["learning_starts:75", "planner_gradient_steps:10", "planner_newest_fraction:1.0", TINY_PLANNER, NETWORKS]
     return [*base.split(), *options.split(), "-f", str(folder), "-params", *params]
 
 
@@ -66,7 +66,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_run_leaves_an_agent_that_answers_with_its_planner(finished: Path) -> None:
     model = SAID.load(finished / f"{ENV}.zip")
-    assert model.num_timesteps == 400
+    assert model.num_timesteps == 200
     assert model.policy.planner_is_trained
     assert model.policy.max_delay == 2
     assert load_run(finished, device="cpu").info["delay"] == 2
@@ -80,6 +80,9 @@ def test_a_finished_run_resumes_to_the_same_agent(finished: Path, tmp_path: Path
     copy = Path(shutil.copytree(finished, tmp_path / "copy"))
     train.main(["--resume", str(copy)])
     assert_same_agents(finished, copy)
+    (copy / "checkpoint.zip").write_bytes(b"half of one")
+    with pytest.raises(SystemExit, match=r"train: error: Cannot load .*checkpoint\.zip': the file is damaged"):
+        train.main(["--resume", str(copy)])
 
 
 def test_a_killed_run_goes_on_from_its_checkpoint_twice_alike(
@@ -87,7 +90,7 @@ def test_a_killed_run_goes_on_from_its_checkpoint_twice_alike(
 ) -> None:
     def save(callback: TrainingCheckpointCallback, original: Any = TrainingCheckpointCallback.save) -> None:
         original(callback)
-        if callback.model.num_timesteps >= 300:
+        if callback.model.num_timesteps >= 150:
             raise Killed
 
     monkeypatch.setattr(TrainingCheckpointCallback, "save", save)
@@ -95,17 +98,17 @@ def test_a_killed_run_goes_on_from_its_checkpoint_twice_alike(
         train.main(arguments(tmp_path))
     monkeypatch.undo()
     folder = run_of(tmp_path)
-    assert load_tree(folder / "checkpoint.zip")["counters"]["num_timesteps"] == 300
+    assert load_tree(folder / "checkpoint.zip")["counters"]["num_timesteps"] == 150
     copy = Path(shutil.copytree(folder, tmp_path / "copy"))
     for each in (folder, copy):
         train.main(["--resume", str(each)])
-        assert "at step 300" in capsys.readouterr().out
+        assert "at step 150" in capsys.readouterr().out
     assert_same_agents(folder, copy)
-    assert SAID.load(folder / f"{ENV}.zip").num_timesteps == 400
-    assert np.load(folder / "expert" / "evaluations.npz")["timesteps"].tolist() == [200, 400]
+    assert SAID.load(folder / f"{ENV}.zip").num_timesteps == 200
+    assert np.load(folder / "expert" / "evaluations.npz")["timesteps"].tolist() == [100, 200]
 
 
-# scripts/train.py with checkpoints of the planner every 10 updates, not 1,000, that kills itself at the 15th.
+# scripts/train.py with checkpoints of the planner every 5 updates, not 1,000, that kills itself at the 8th.
 KILLED_AMID_UPDATES = """
 import functools, os, runpy, signal
 
@@ -113,12 +116,12 @@ from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.zoo import manager
 
 def step(trainer, original=PlannerTrainer.step):
-    if trainer.n_updates == 15:
+    if trainer.n_updates == 8:
         os.kill(os.getpid(), signal.SIGKILL)
     original(trainer)
 
 PlannerTrainer.step = step
-manager.PlannerTrainingCallback = functools.partial(manager.PlannerTrainingCallback, save_interval=10)
+manager.PlannerTrainingCallback = functools.partial(manager.PlannerTrainingCallback, save_interval=5)
 runpy.run_path(SCRIPT, run_name="__main__")
 """
 
@@ -128,14 +131,15 @@ def test_a_run_killed_amid_the_planners_updates_ends_as_if_it_was_not(finished: 
     killed = subprocess.run([sys.executable, "-c", code, *arguments(tmp_path)], capture_output=True, timeout=240)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     folder = run_of(tmp_path)
-    assert load_tree(folder / "planner_checkpoint.zip")["trainer"]["n_updates"] == 10
+    assert load_tree(folder / "planner_checkpoint.zip")["trainer"]["n_updates"] == 5
     train.main(["--resume", str(folder)])
     assert_same_agents(finished, folder)
 
 
 def test_a_given_agent_learns_as_many_steps_as_a_new_one(tmp_path: Path) -> None:
     command, name = "--algo said --env Pendulum-v1 --delay 1 --preset smoke -n 150 --seed 3", "Pendulum-v1.zip"
-    params = ["-params", "learning_starts:100", "planner_gradient_steps:2", "planner_trial_episodes:0", TINY_PLANNER]
+    own = ["learning_starts:100", "planner_gradient_steps:2", "planner_trial_episodes:0"]
+    params = ["-params", *own, TINY_PLANNER, NETWORKS]
     first, second = (tmp_path / "said" / f"Pendulum-v1-delay1-seed3_{k}" for k in (1, 2))
     train_here(tmp_path, command, *params)
     train_here(tmp_path, command, "-i", first / name, *params)
@@ -226,7 +230,7 @@ def test_the_log_path_names_the_delay(delay: Delay, name: str) -> None:
 
 def test_the_expert_can_learn_under_another_delay(tmp_path: Path) -> None:
     command = "--algo said --env Pendulum-v1 --delay 0 3 --expert-delay 0 --preset smoke -n 520 --seed 3"
-    train_here(tmp_path, command, "-params", TINY_PLANNER)
+    train_here(tmp_path, command, "-params", "planner_gradient_steps:5", TINY_PLANNER, NETWORKS)
     played = load_run(tmp_path / "said" / "Pendulum-v1-delay0-3-expert0-seed3_1", device="cpu")
     assert played.info["delay"] == "EpisodeDelay(low=0, high=3)"
     model = played.model
@@ -270,9 +274,10 @@ def test_a_nan_of_the_task_is_in_no_checkpoint(
 
     monkeypatch.setattr(mine.Mine, "steps", 0)
     command = "--algo sadr --env Mine-v0 --gym-packages mine --delay 1 --seed 3 --checkpoint-freq 20 -n 150"
-    task = ["--env-kwargs", "nan_at:90", f"nan_in:{nan_in!r}", "-params", "learning_starts:30", "buffer_size:200"]
+    task = ["--env-kwargs", "nan_at:90", f"nan_in:{nan_in!r}"]
+    settings = ["-params", "learning_starts:30", "buffer_size:200", NETWORKS, *params]
     with np.errstate(all="ignore"), pytest.raises(ValueError):
-        train_here(tmp_path, command, *task, *params)
+        train_here(tmp_path, command, *task, *settings)
     run = tmp_path / "sadr" / "Mine-v0-delay1-seed3_1"
     assert f"by an error; --resume {run} goes on from the last checkpoint" in capsys.readouterr().out
     assert load_tree(run / "checkpoint.zip")["counters"]["num_timesteps"] == 80
@@ -290,7 +295,7 @@ def test_a_full_disk_at_the_planners_checkpoint_loses_no_planner(
     with pytest.warns(UserWarning, match=r"written to .*planner_checkpoint.zip \(.*No space left on device"):
         train.main(arguments(tmp_path))
     model = SAID.load(run_of(tmp_path) / f"{ENV}.zip")
-    assert model.policy.planner_updates == 20
+    assert model.policy.planner_updates == 10
 
 
 # ---------------------------------------------------------------------------------------------------- the command

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ from trained_run import ENV, PLANNER, train_here
 
 from sb3_said import SAID
 from sb3_said.files.archive import load_tree
-from sb3_said.offline import BC, DQL, IQL, REFERENCE_RETURNS, DQLConfig
+from sb3_said.offline import BC, DQL, IQL, REFERENCE_RETURNS, DQLConfig, IQLConfig
 from sb3_said.offline.learning import GradientStepBar
 from sb3_said.zoo import evaluate, train, tune
 from sb3_said.zoo.manager import ALGOS
@@ -26,8 +28,11 @@ from sb3_said.zoo.record import Record
 from sb3_said.zoo.runs import answers, load_run
 
 EVERY = "--eval-freq 10 --eval-episodes 2 --log-interval 10".split()
-BC_PARAMS = ["-params", "batch_size:16", "policy_kwargs:dict(net_arch=[16])"]
-SAID_PARAMS = ["-params", f"planner_kwargs:{PLANNER}"]
+PARAMS = {
+    "bc": ["-params", "batch_size:16", "policy_kwargs:dict(net_arch=[16])"],
+    "dql": ["-params", "batch_size:16"],
+    "said": ["-params", f"planner_kwargs:{PLANNER}", "iql_kwargs:dict(expectile=0.9)"],
+}
 
 
 @pytest.fixture(scope="module")
@@ -71,8 +76,7 @@ def command(algo: str, log: Path, steps: int = 20) -> list[str]:
 def finished(request: pytest.FixtureRequest, log: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
     """A run of each algorithm, evaluated twice on the way, and its folder."""
     folder = tmp_path_factory.mktemp("logs")
-    params = BC_PARAMS if request.param == "bc" else SAID_PARAMS
-    train_here(folder, " ".join(command(request.param, log)), *EVERY, *params)
+    train_here(folder, " ".join(command(request.param, log)), *EVERY, *PARAMS[request.param])
     return request.param, run_of(folder, request.param)
 
 
@@ -87,6 +91,8 @@ def test_a_run_leaves_its_agent_record_log_and_evaluations(finished: tuple[str, 
     assert np.load(run / "evaluations.npz")["timesteps"].tolist() == [10, 20]
     assert answers(load_run(run / "best_model.zip", device="cpu").model) == answers(model)
     assert not list(run.glob("*monitor.csv")) and not (run / "expert").exists()
+    if isinstance(model, SAID):
+        assert model.policy.values is not None and model.policy.values.config == IQLConfig(expectile=0.9)
     column = "train/action_error" if algo == "bc" else "iql/v_loss"
     assert column in (run / "progress.csv").read_text()
 
@@ -102,9 +108,8 @@ def test_a_killed_run_ends_as_one_that_was_not(
         return original(self, watcher)
 
     monkeypatch.setattr(ALGOS[algo], "_goes_on", die_after)
-    params = BC_PARAMS if algo == "bc" else SAID_PARAMS
     with pytest.raises(Killed):
-        train_here(tmp_path, " ".join(command(algo, log)), *EVERY, *params)
+        train_here(tmp_path, " ".join(command(algo, log)), *EVERY, *PARAMS[algo])
     monkeypatch.undo()
     run = run_of(tmp_path, algo)
     assert not (run / f"{ENV}.zip").exists()
@@ -116,11 +121,15 @@ def test_a_killed_run_ends_as_one_that_was_not(
     np.testing.assert_array_equal(rows[0]["results"][0], rows[1]["results"][0])
 
 
-@pytest.mark.parametrize("algo", ["bc", "dql"])
-def test_other_data_is_not_gone_on_with(algo: str, log: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("algo", PARAMS)
+def test_other_data_is_not_gone_on_with(
+    algo: str, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     mine = tmp_path / "mine.npz"
     mine.write_bytes(log.read_bytes())
-    train_here(tmp_path, " ".join(command(algo, mine, steps=2)), "-params", "batch_size:16")
+    train_here(tmp_path, " ".join(command(algo, mine, steps=2)), *PARAMS[algo])
+    words = ["--resume", str(run_of(tmp_path, algo))]
+    words += ["-n", "4"] if algo != "said" else []  # whose planner's training has the length it began with
     with np.load(log) as file:
         columns = dict(file)
     changes: list[dict[str, Any]] = [
@@ -131,24 +140,31 @@ def test_other_data_is_not_gone_on_with(algo: str, log: Path, tmp_path: Path) ->
     ]
     for change in changes:
         np.savez(mine, **columns | change)
-        with pytest.raises(ValueError, match="of a training on other data; resume with the dataset of the run"):
-            train.main(["--resume", str(run_of(tmp_path, algo)), "-n", "4"])
+        with pytest.raises(SystemExit, match=r"train: error: Cannot load .*zip': it is of a training on other data; "):
+            train.main(words)
+    assert "Stopped" not in capsys.readouterr().out  # it did not begin
     np.savez(mine, **columns)
-    train.main(["--resume", str(run_of(tmp_path, algo)), "-n", "4"])
-    assert load_run(run_of(tmp_path, algo), device="cpu").model.num_timesteps == 4
+    train.main(words)
+    assert load_run(run_of(tmp_path, algo), device="cpu").model.num_timesteps == (2 if algo == "said" else 4)
 
 
 @pytest.mark.parametrize("algo", ["bc", "said"])
-def test_a_resume_says_that_its_data_is_gone_or_damaged(algo: str, log: Path, tmp_path: Path) -> None:
+def test_a_resume_and_a_search_say_that_their_data_is_gone_or_damaged(
+    algo: str, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     mine = tmp_path / "mine.npz"
     mine.write_bytes(log.read_bytes())
-    train_here(tmp_path, " ".join(command(algo, mine, steps=2)), *(BC_PARAMS if algo == "bc" else SAID_PARAMS))
+    train_here(tmp_path, " ".join(command(algo, mine, steps=2)), *PARAMS[algo])
+    run = str(run_of(tmp_path, algo))
     mine.write_bytes(log.read_bytes()[:500])
-    with pytest.raises(SystemExit, match=r"train: error: .*mine\.npz cannot be read; it is damaged"):
-        train.main(["--resume", str(run_of(tmp_path, algo)), "-n", "4"])
-    mine.unlink()
-    with pytest.raises(SystemExit, match=r"train: error: There is no dataset .*mine\.npz"):
-        train.main(["--resume", str(run_of(tmp_path, algo)), "-n", "4"])
+    for message in (r".*mine\.npz cannot be read; it is damaged", r"There is no dataset .*mine\.npz"):
+        with pytest.raises(SystemExit, match=f"train: error: {message}"):
+            train.main(["--resume", run, "-n", "4"])
+        if algo == "said":  # bc has no planner to tune
+            with pytest.raises(SystemExit):
+                tune.main([run, "--depths", "2", "--device", "cpu"])
+            assert re.search(message, capsys.readouterr().err)
+        mine.unlink(missing_ok=True)
 
 
 @pytest.mark.parametrize("algo", ["bc", "said"])
@@ -162,27 +178,38 @@ def test_the_bar_counts_gradient_steps(
         close(bar)
 
     monkeypatch.setattr(GradientStepBar, "_on_training_end", note)
-    params = BC_PARAMS if algo == "bc" else SAID_PARAMS
-    train_here(tmp_path, " ".join(command(algo, log, steps=4)), "-P", *params, "n_envs:2")
+    train_here(tmp_path, " ".join(command(algo, log, steps=4)), "-P", *PARAMS[algo], "n_envs:2")
     assert bars == [(4, 4)] and "/8" not in capsys.readouterr().out
 
 
 def test_evaluate_has_scores_and_the_best_agent_beside_the_last(
-    finished: tuple[str, Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    finished: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     algo, run = finished
     monkeypatch.setitem(REFERENCE_RETURNS, ENV.split("-")[0].lower(), (10.0, 210.0))
     who = "bc" if algo == "bc" else "planner"
     best = ALGOS[algo].load(run / f"{ENV}.zip", device="cpu")
-    for steps, labels in ((7, [(who, "last", 20), (who, "best", 7)]), (20, [(who, "last", 20)])):
+    killed = Path(shutil.copytree(run, tmp_path / "killed"))
+    (killed / f"{ENV}.zip").unlink()
+    for folder, steps, labels in (
+        (run, 7, [(who, "last", 20), (who, "best", 7)]),
+        (run, 20, [(who, "last", 20)]),
+        (killed, 7, [(who, "best", 7)]),
+    ):
         best.num_timesteps = steps
-        best.save(run / "best_model.zip")
-        evaluate.main([str(run), "--episodes", "2", "--latency-calls", "0", "--device", "cpu", "--delay", "1"])
-        results = json.loads((run / "evaluation.json").read_text())["results"]
+        best.save(folder / "best_model.zip")
+        evaluate.main([str(folder), "--episodes", "2", "--latency-calls", "0", "--device", "cpu", "--delay", "1"])
+        results = json.loads((folder / "evaluation.json").read_text())["results"]
         assert [(r["label"], r["which"], r["trained_steps"]) for r in results] == labels
         for r in results:
             assert r["normalized_score"][0] == pytest.approx((np.mean(r["returns"]) - 10) / 2)
-        assert ("best" in capsys.readouterr().out) == (steps == 7)
+        header, row = capsys.readouterr().out.splitlines()[-3:-1]
+        kinds = [which for _, which, _ in labels]
+        named = [kind for kind in ("mean", "last", "best") if f"{kind} return" in header]
+        assert named == (["mean"] if kinds == ["last"] else kinds)
+        assert row.split()[0] == who
+        for r in results:  # in the columns of its own
+            assert f"{r['mean_return']['value']:,.1f}" in row.split()
     assert evaluate.score_of(evaluate.Summary.from_episodes("x", [1.0, 2.0], [1, 1]), "Pendulum-v1") is None
 
 
@@ -282,10 +309,10 @@ def test_a_stop_writes_a_checkpoint(log: Path, tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(OfflineExperimentManager, "__init__", remember)
     monkeypatch.setattr(BC, "_goes_on", ask)
     monkeypatch.setattr(SAID, "_goes_on", ask)
-    for algo, params, name in (("bc", BC_PARAMS, "checkpoint"), ("said", SAID_PARAMS, "planner_checkpoint")):
+    for algo, name in (("bc", "checkpoint"), ("said", "planner_checkpoint")):
         made.clear()
         with pytest.raises(SystemExit) as stop:
-            train_here(tmp_path, " ".join(command(algo, log)), *params)
+            train_here(tmp_path, " ".join(command(algo, log)), *PARAMS[algo])
         assert stop.value.code == 130
         state = load_tree(run_of(tmp_path, algo) / f"{name}.zip")
         assert (state["counters"]["num_timesteps"] if algo == "bc" else state["trainer"]["n_updates"]) == 13

@@ -14,6 +14,7 @@ from sb3_said.zoo.arguments import Delay
 from sb3_said.zoo.manager import DelayedExperimentManager, Run
 
 ENV = "InvertedPendulum-v5"
+NETWORKS = "policy_kwargs:dict(net_arch=[16])"
 PLANNER = "dict(depth=1, d_model=32, horizon=4, sampling_steps=1, n_candidates=2, batch_size=8)"
 
 
@@ -27,13 +28,13 @@ def train_run(folder: Path, algo: str, *params: str, delay: Sequence[int] = (2,)
     train.main(
         ["--algo", algo, "--env", ENV, "--delay", *map(str, delay), "-f", str(folder), "--seed", "3",
          "--num-threads", "1", "--eval-freq", "-1", "--device", "cpu", "--verbose", "0", "-n", "200", *options,
-         "-params", "learning_starts:100", "buffer_size:400", *params]
+         "-params", "learning_starts:100", "buffer_size:400", NETWORKS, *params]
     )  # fmt: skip
     return next((folder / algo).iterdir())
 
 
 def train_said(folder: Path, *params: str, delay: Sequence[int] = (2,)) -> Path:
-    planner = ("planner_gradient_steps:3", f"planner_kwargs:{PLANNER}")
+    planner = ("planner_gradient_steps:3", "planner_trial_episodes:1", f"planner_kwargs:{PLANNER}")
     return train_run(folder, "said", *planner, *params, delay=delay)
 
 
