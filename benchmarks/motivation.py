@@ -230,6 +230,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
         document["scores"] = {
             name: [float(normalized_score(s.mean_return.value, args.env)) for s in row] for name, row in table.items()
         }
+        show({k: [f"{x:.1f}" for x in row] for k, row in document["scores"].items()}, "score at delay", args.delays)
     document["origin"] = origin(LoadedRun(said, lambda: task, None, Path(), {}))
     if args.json is not None:
         write_json(args.json, document)

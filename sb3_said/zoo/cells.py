@@ -13,6 +13,7 @@ import numpy as np
 from sb3_said.delays.text import make_process
 from sb3_said.evaluation import Interval, confidence_interval, stratified_interval, worst_tenth
 from sb3_said.files.atomic import write_json
+from sb3_said.offline import normalized_score, reference_returns
 
 AGE = ", age "  # in the name of a column, before the error
 #: Returns by row and column: (n_episodes,), or (n_seeds, n_episodes) of several training seeds.
@@ -131,19 +132,38 @@ def print_table(table: Table, delays: list[int | str]) -> None:
     Ages that are told wrong have columns of their own and count in no average. A line below it says what the intervals
     are over.
     """
-    columns: dict[str, list[int | str]] = {str(delay): [delay] for delay in delays}
-    for name, kind in (("mean of fixed", int), ("mean of random", str)):
-        columns[name] = [delay for delay in delays if isinstance(delay, kind) and AGE not in str(delay)]
-    _print_rows(table, columns, confidence_interval)
+    columns = _columns(delays)
+    _print_rows("return under delay", table, columns, confidence_interval)
     several = {agent: row for agent, row in table.items() if row and all(x.ndim == 2 for x in row.values())}
     if several:
         print("\nThe same agents, with episodes drawn within training seeds:")
-        _print_rows(several, columns, stratified_interval)
+        _print_rows("return under delay", several, columns, stratified_interval)
 
 
-def _print_rows(table: Table, columns: dict[str, list[int | str]], interval: Callable[[Any], Interval]) -> None:
+def print_scores(table: Table, delays: list[int | str], env_id: str) -> None:
+    """Print the table again in D4RL's normalised scores, and nothing for a task that has none."""
+    if reference_returns(env_id) is not None:
+        scores = {
+            row: {delay: np.asarray(normalized_score(x, env_id)) for delay, x in returns.items()}
+            for row, returns in table.items()
+        }
+        print()
+        _print_rows("normalised score", scores, _columns(delays), confidence_interval)
+
+
+def _columns(delays: list[int | str]) -> dict[str, list[int | str]]:
+    """Return the delays behind each column: each by itself, then those that an average is over."""
+    columns: dict[str, list[int | str]] = {str(delay): [delay] for delay in delays}
+    for name, kind in (("mean of fixed", int), ("mean of random", str)):
+        columns[name] = [delay for delay in delays if isinstance(delay, kind) and AGE not in str(delay)]
+    return columns
+
+
+def _print_rows(
+    what: str, table: Table, columns: dict[str, list[int | str]], interval: Callable[[Any], Interval]
+) -> None:
     averages = {agent: [average(row, column, interval) for column in columns.values()] for agent, row in table.items()}
-    rows = [["return under delay", *columns]]
+    rows = [[what, *columns]]
     rows += [[agent, *(text for text, _ in row)] for agent, row in averages.items()]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     rows.insert(1, ["-" * width for width in widths])

@@ -14,6 +14,7 @@ from tqdm import tqdm
 from sb3_said.evaluation import Summary, collect_observations, measure_latency, plots
 from sb3_said.files.atomic import write_json
 from sb3_said.offline import normalized_score, reference_returns
+from sb3_said.zoo.answer import BEST_NAME
 from sb3_said.zoo.arguments import TRUST, add_run, check_positive, explained, make_parser, read_delay
 from sb3_said.zoo.latency import evaluate_in_real_time
 from sb3_said.zoo.runs import LoadedRun, answering, answers, control_period, load_run, origin
@@ -35,8 +36,8 @@ examples:
 Episode i starts from reset seed --seed + i, so two agents meet the same starts; --n-envs changes only the speed. A
 return is the undiscounted sum of the task's own rewards, and a score is D4RL's, 0 for a random policy and 100 for an
 expert, where D4RL has both. Decisions are timed after the episodes, one at a time, from NumPy observation to NumPy
-action. The last agent of a run is played, and where an earlier one did best in training, that "best" one too: it was
-chosen on other episodes than these.
+action. The last agent of a run is played, and where an earlier one did best in training, that "best" one too, or alone
+where the run was killed: it was chosen on other episodes than these.
 
 With --realtime every answer is also made to wait: it takes effect at the first control step after the time that it
 took. The row "in real time" plans for that step. The row "latency ignored" plans for the step at which it was asked,
@@ -67,8 +68,9 @@ def main(argv: list[str] | None = None) -> None:
         delay = 0 if args.realtime and not args.delay else read_delay(args.delay)
         how_played = args.algo, args.env, delay, args.device, None, args.gym_packages
         run = load_run(args.run, *how_played)
-        runs = {"last": run}
-        if Path(args.run).is_dir() and (best := run.folder / "best_model.zip").is_file():
+        best = run.folder / BEST_NAME
+        runs = {"best" if Path(run.info["file"]) == best else "last": run}
+        if "last" in runs and Path(args.run).is_dir() and best.is_file():
             runs["best"] = load_run(best, *how_played)
             if runs["best"].info["trained_steps"] == run.info["trained_steps"]:
                 del runs["best"]  # the last one is the best
@@ -91,7 +93,7 @@ def main(argv: list[str] | None = None) -> None:
                     played.append((which, summary))
                     counted[summary.label if which == "last" else f"{summary.label}, best"] = counts
     rows = [replace(s, label=s.label if which == "last" else f"{s.label}, best") for which, s in played]
-    print_table(rows, run.info["env"])
+    print_table(played, run.info["env"])
     for label, counts in counted.items():
         print(f"{label}: {', '.join(f'{name} {value:g}' for name, value in counts.items() if 'gap' not in name)}")
 
@@ -141,20 +143,30 @@ def score_of(summary: Summary, env_id: str) -> list[float] | None:
     return [float(normalized_score(end, env_id)) for end in ends]
 
 
-def print_table(summaries: list[Summary], env_id: str = "") -> None:
-    """Print one line for each answer.
+def print_table(played: list[tuple[str, Summary]], env_id: str = "") -> None:
+    """Print one line for each answer, with the columns of the last agent and, where it is another, of the best.
 
+    :param played: which of the two, "last" or "best", and what it did
     :param env_id: of a task, for the score
     """
-    width = max(10, *(len(s.label) for s in summaries))
-    print(f"{'':{width}} {'mean return':>12} {'95 % interval':>24} {'score':>7} {'length':>8}   decision latency")
-    for s in summaries:
-        interval = f"[{s.mean_return.low:,.1f}, {s.mean_return.high:,.1f}]"
-        speed = "not measured" if s.latency is None else str(s.latency)
-        scores = score_of(s, env_id)
-        score = "-" if scores is None else f"{scores[0]:.1f}"
-        numbers = f"{s.mean_return.value:12,.1f} {interval:>24} {score:>7} {s.mean_length.value:8,.1f}"
-        print(f"{s.label:{width}} {numbers}   {speed}")
+    table: dict[str, dict[str, Summary]] = {}
+    for which, summary in played:
+        table.setdefault(summary.label, {})[which] = summary
+    kinds = list(dict.fromkeys(which for which, _ in played))
+    names = {kind: "mean return" if kinds == ["last"] else f"{kind} return" for kind in kinds}
+    width = max(10, *map(len, table))
+    heads = [f"{names[kind]:>12} {'95 % interval':>24} {'score':>7} {'length':>8}" for kind in kinds]
+    print(f"{'':{width}} {' '.join(heads)}   decision latency")
+    for label, row in table.items():
+        columns = " ".join(_columns(row[kind], env_id) for kind in kinds)
+        print(f"{label:{width}} {columns}   {row[kinds[0]].latency or 'not measured'}")
+
+
+def _columns(summary: Summary, env_id: str) -> str:
+    mean, scores = summary.mean_return, score_of(summary, env_id)
+    interval = f"[{mean.low:,.1f}, {mean.high:,.1f}]"
+    score = "-" if scores is None else f"{scores[0]:.1f}"
+    return f"{mean.value:12,.1f} {interval:>24} {score:>7} {summary.mean_length.value:8,.1f}"
 
 
 def draw(path: Path, summaries: list[Summary], folder: Path, title: str) -> None:

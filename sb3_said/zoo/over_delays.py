@@ -21,7 +21,7 @@ from sb3_said.delays import FixedDelay
 from sb3_said.delays.text import age_range, make_process
 from sb3_said.evaluation import Summary, plots
 from sb3_said.zoo.arguments import TRUST, add_playing, check_positive, explained, largest_delay, make_parser, read_delay
-from sb3_said.zoo.cells import AGE, Cell, Results, make_table, print_manners, print_table
+from sb3_said.zoo.cells import AGE, Cell, Results, make_table, print_manners, print_scores, print_table
 from sb3_said.zoo.runs import ANSWERS, LoadedRun, answering, answers, delay_name, load_run, longest_delay, origin
 
 EPILOG = f"""\
@@ -81,7 +81,9 @@ def main(argv: list[str] | None = None) -> None:
     table = make_table(shown, rows)
     order = delays or list(dict.fromkeys(cell.delay for cell in shown))
     in_order = sorted(shown, key=lambda cell: (cell.age_error != 0, order.index(cell.delay), cell.age_error))
-    print_table(table, list(dict.fromkeys(cell.column for cell in in_order)))
+    columns = list(dict.fromkeys(cell.column for cell in in_order))
+    print_table(table, columns)
+    print_scores(table, columns, Results(args.json).settings["env"])
     print_manners(shown, rows)
     if args.plot is not None and any(table.values()):
         settings = Results(args.json).settings

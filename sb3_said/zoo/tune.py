@@ -211,9 +211,8 @@ def report(args: argparse.Namespace, run: LoadedRun, study: Study, winner: Froze
     print(f"\n{len(trials)} trials, {pruned} of them pruned. Best: {describe(winner.params)}, mean return "
           f"{winner.value:,.1f} on the episodes it was chosen by.")  # fmt: skip
     print(f"On {args.report_episodes} other episodes:")
-    print_table(
-        [Summary.from_episodes(p["label"], p["returns"], p["lengths"], Latency(**p["latency"])) for p in played]
-    )
+    rows = (Summary.from_episodes(p["label"], p["returns"], p["lengths"], Latency(**p["latency"])) for p in played)
+    print_table([("last", row) for row in rows])
     if find_spec("matplotlib") is None:
         print('No plot: it needs matplotlib, pip install "sb3_said[plots]"')
     else:

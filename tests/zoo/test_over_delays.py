@@ -19,8 +19,9 @@ from small_run import ENV, write_run
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.evaluation import Summary
+from sb3_said.offline.scores import REFERENCE_RETURNS
 from sb3_said.zoo import evaluate, over_delays
-from sb3_said.zoo.cells import Cell, average
+from sb3_said.zoo.cells import Cell, average, print_scores
 from sb3_said.zoo.record import Record
 from sb3_said.zoo.runs import load_run
 
@@ -283,6 +284,19 @@ def test_an_average_pairs_episodes_of_one_start() -> None:
     assert average(row, [0, 4]) == ("5.0 [5.0, 5.0]", over)  # each start has a mean of 5
     assert average(row, [0, 4, 8]) == ("5.0 [5.0, 5.0], 2 of 3", over)
     assert average(row, [8]) == ("-", "")
+
+
+def test_scores_are_the_returns_between_those_of_a_random_policy_and_an_expert(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    low, high = REFERENCE_RETURNS["hopper"]
+    returns = low + np.array([0.2, 0.4, 0.6]) * (high - low)
+    print_scores({"said": {0: returns}}, [0, 4], "Hopper-v5")
+    cells = capsys.readouterr().out.splitlines()[-2].split("|")
+    t = ttest_1samp([20.0, 40.0, 60.0], 0.0).confidence_interval()
+    assert [cell.strip() for cell in cells[1:4]] == ["said", f"40.0 [{t.low:.1f}, {t.high:.1f}]", "-"]
+    print_scores({"said": {0: returns}}, [0, 4], "Pendulum-v1")
+    assert not capsys.readouterr().out
 
 
 def test_an_average_pairs_training_seeds_where_all_delays_have_as_many() -> None:
