@@ -69,7 +69,7 @@ class Setting(NamedTuple):
         return slice(first, first + 1 if self.config.scored_states == "decision" else self.length)
 
 
-CPU = PlannerConfig(depth=2, d_model=128, sampling_steps=5, temperature=0.0, first_guess=False)
+CPU = PlannerConfig(depth=2, d_model=128, sampling_steps=5, temperature=0.0, first_guess="none")
 MANY = replace(CPU, n_candidates=16, temperature=0.5, scored_states="future")
 SETTINGS = (
     Setting("paper", PlannerConfig.paper(), rounds=20),
@@ -152,7 +152,7 @@ def measure_setting(setting: Setting, rounds: int, device: str, rates: dict[str,
     obs = observe(env, setting.delay)
     plain = make_plain(setting, device, env)
     config = setting.config
-    guessing = make_agent(setting._replace(config=replace(config, first_guess=True)), device)
+    guessing = make_agent(setting._replace(config=replace(config, first_guess="residual")), device)
     work = f"{config.sampling_steps} steps, {setting.n_candidates} candidate{'s' if setting.n_candidates > 1 else ''}"
     name = f"{setting.name}: depth {config.depth}, width {config.d_model}, {work}"
     size = setting.n_candidates * setting.length * config.d_model

@@ -73,7 +73,7 @@ def make_trainer(depth: int, precision: str, args: argparse.Namespace, source: W
         horizon=args.horizon,
         batch_size=args.batch_size,
         precision=precision,
-        first_guess=False,
+        first_guess="none",
     )
     planner = InpaintingPlanner(OBS_DIM, ACT_DIM, args.delay, config).to(args.device)
     return PlannerTrainer(planner, source, GRADIENT_STEPS, held_out=0.0)

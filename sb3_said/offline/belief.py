@@ -84,14 +84,11 @@ class LearnedBelief(nn.Module):
 
 
 class RolledOutModel(LearnedBelief):
-    """A model of one step, (s, a) to s', which is rolled out over the actions since: its errors compound.
+    """A model of one step, (s, a) to s', which is rolled out over the actions since: its errors compound."""
 
-    :param hidden: width of the two hidden layers
-    """
-
-    def __init__(self, obs_dim: int, act_dim: int, max_delay: int, hidden: int = 512):
+    def __init__(self, obs_dim: int, act_dim: int, max_delay: int):
         super().__init__(obs_dim, max_delay)
-        self.model = OneStepModel(obs_dim, act_dim, hidden)
+        self.model = OneStepModel(obs_dim, act_dim)
 
     def fit_scale(self, states: th.Tensor) -> None:
         """Take over how states and their moves are spread, so that small moves count as much as large ones.

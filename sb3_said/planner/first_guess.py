@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch as th
 from torch import nn
 from tqdm.auto import tqdm
@@ -13,7 +15,7 @@ from sb3_said.planner.values import window_weight
 from sb3_said.replay.windows import WindowSource
 
 CLONE_WIDTH = 256
-LEARNING_RATE = 1e-3
+MODEL_LEARNING_RATE, CLONE_LEARNING_RATE = 3e-3, 1e-3
 BATCH_SIZE = 256
 FARTHEST = 10.0  # standard deviations: a model that is asked far from its data must not run away
 
@@ -26,11 +28,13 @@ class FirstGuess(nn.Module):
     knows nothing of them. That is the planner's to mend: it is shown the guess, and not bound to it.
 
     States are z-scored, actions in [-1, 1].
+
+    :param is_residual: whether the model has residual blocks, or plain layers
     """
 
-    def __init__(self, obs_dim: int, act_dim: int) -> None:
+    def __init__(self, obs_dim: int, act_dim: int, is_residual: bool = True) -> None:
         super().__init__()
-        self.model = OneStepModel(obs_dim, act_dim)
+        self.model = OneStepModel(obs_dim, act_dim, is_residual)
         self.clone = plain_network(obs_dim, act_dim, CLONE_WIDTH)
 
     @th.no_grad()
@@ -89,7 +93,11 @@ def fit_first_guess(
     :param progress_bar: show one
     """
     guess.model.move_std.copy_(normalizer.move_std[0])
-    optimizer = th.optim.Adam(guess.parameters(), LEARNING_RATE, fused=True)
+    groups: list[dict[str, Any]] = [
+        {"params": [*guess.model.parameters()], "lr": MODEL_LEARNING_RATE},
+        {"params": [*guess.clone.parameters()], "lr": CLONE_LEARNING_RATE},
+    ]
+    optimizer = th.optim.Adam(groups, fused=True)
     scheduler = th.optim.lr_scheduler.CosineAnnealingLR(optimizer, n_updates)
     for _ in tqdm(range(n_updates), desc="first guess", disable=not progress_bar):
         windows = source.sample(BATCH_SIZE, 2, generator, config.early_probability)

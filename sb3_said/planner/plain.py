@@ -13,17 +13,36 @@ def plain_network(n_in: int, n_out: int, hidden: int) -> nn.Sequential:
     )
 
 
+class ResidualBlock(nn.Module):
+    """Two layers whose answer is added to what they read, normalised before (as in transformers, and in SimbaV1)."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.net = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """Return another (B, width)."""
+        return x + self.net(x)
+
+
+def residual_network(n_in: int, n_out: int, width: int, n_blocks: int) -> nn.Sequential:
+    """Return a network of residual blocks."""
+    blocks = [ResidualBlock(width) for _ in range(n_blocks)]
+    return nn.Sequential(nn.Linear(n_in, width), *blocks, nn.Linear(width, n_out))
+
+
 class OneStepModel(nn.Module):
     """Predicts the state that follows an action, as a difference from the one before, in units of its usual moves.
 
-    :param hidden: width of the two hidden layers
+    :param is_residual: two residual blocks of 256, or two plain layers of 512
     """
 
     move_std: th.Tensor  # (obs_dim,), set it to how far z-scored states move in a step
 
-    def __init__(self, obs_dim: int, act_dim: int, hidden: int = 512) -> None:
+    def __init__(self, obs_dim: int, act_dim: int, is_residual: bool = True) -> None:
         super().__init__()
-        self.net = plain_network(obs_dim + act_dim, obs_dim, hidden)
+        n_in = obs_dim + act_dim
+        self.net = residual_network(n_in, obs_dim, 256, 2) if is_residual else plain_network(n_in, obs_dim, 512)
         self.register_buffer("move_std", th.ones(obs_dim))
 
     def forward(self, state: th.Tensor, action: th.Tensor) -> th.Tensor:

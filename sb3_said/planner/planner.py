@@ -68,9 +68,11 @@ class InpaintingPlanner(nn.Module):
             config.depth,
             config.embed_known,
             config.extra_state_probability > 0,
-            config.first_guess,
+            config.first_guess != "none",
         )
-        self.first_guess = FirstGuess(obs_dim, act_dim) if config.first_guess else None
+        self.first_guess = None
+        if config.first_guess != "none":
+            self.first_guess = FirstGuess(obs_dim, act_dim, config.first_guess == "residual")
         self.normalizer = Normalizer(
             obs_dim, act_dim, self.window_length, config.action_transform, config.relative_states
         )

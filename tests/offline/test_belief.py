@@ -44,8 +44,8 @@ def source():
 @pytest.fixture(scope="module", params=[RolledOutModel, RegressedPresent])
 def learned(request, source):
     th.manual_seed(0)
-    belief = request.param(2, 1, DELAY, hidden=64)
-    train_belief(belief, source, 300, learning_rate=5e-3)
+    belief = request.param(2, 1, DELAY)
+    train_belief(belief, source, 300, learning_rate=3e-3)
     return belief
 
 

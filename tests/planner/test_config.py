@@ -15,7 +15,7 @@ def test_paper_config_is_the_papers_table():
     expected |= {"action_transform": "tanh", "scored_states": "all", "batch_size": 256, "learning_rate": 2e-4}
     expected |= {"ema_decay": 0.9999, "weight_factor": 2.0, "warmup_steps": 0, "gradient_clip": None}
     expected |= {"value_scale": "centred", "precision": "float32", "end_time_probability": 0.0}
-    expected |= {"early_probability": 0.0, "first_guess": False}
+    expected |= {"early_probability": 0.0, "first_guess": "none"}
     assert expected.items() <= dataclasses.asdict(config).items()
     assert PlannerConfig.paper(sampling_steps=2).sampling_steps == 2
 
@@ -25,6 +25,10 @@ def test_settings_of_sampling_do_not_decide_the_weights():
     others = dict(sampling_steps=1, n_candidates=2, temperature=1.0, scored_states="all", choice_factor=1.0)
     assert dataclasses.replace(config, **others).weight_settings() == config.weight_settings()
     assert dataclasses.replace(config, depth=4).weight_settings() != config.weight_settings()
+
+
+def test_files_from_before_there_was_a_choice_of_the_first_guess_are_read():
+    assert [PlannerConfig(first_guess=saved).first_guess for saved in (True, False)] == ["plain", "none"]
 
 
 def test_config_survives_json():

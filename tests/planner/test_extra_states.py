@@ -33,7 +33,7 @@ def test_without_extra_states_everything_is_as_it_was_before_there_were_any():
     """Recorded with the planner as it was then, on a CPU."""
     th.manual_seed(3)
     planner = InpaintingPlanner(
-        OBS, ACT, DELAY, dataclasses.replace(SMALL, end_time_probability=0.0, first_guess=False)
+        OBS, ACT, DELAY, dataclasses.replace(SMALL, end_time_probability=0.0, first_guess="none")
     )
     assert sum(p.numel() for p in planner.parameters()) == 44_037
     assert sum(p.double().abs().sum() for p in planner.parameters()).item() == pytest.approx(3163.8683, rel=1e-5)

@@ -31,7 +31,7 @@ def train(source: WindowSource, **changes) -> PlannerTrainer:
         th.manual_seed(0)
         config = PlannerConfig(
             scored_states="future",  # the value reads no action
-            first_guess=False,  # what the network makes of a window alone
+            first_guess="none",  # what the network makes of a window alone
             depth=2,
             d_model=64,
             horizon=5,

@@ -12,7 +12,7 @@ OBS_DIM, ACT_DIM = 3, 2
 def make_model() -> OneStepModel:
     with th.random.fork_rng(devices=[]):
         th.manual_seed(0)
-        return OneStepModel(OBS_DIM, ACT_DIM, hidden=16)
+        return OneStepModel(OBS_DIM, ACT_DIM)
 
 
 @th.no_grad()

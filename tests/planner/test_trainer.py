@@ -31,7 +31,7 @@ def make_trainer(
     gradient_steps=12, held_out=0.1, seed=0, source=None, max_delay=D, device="cpu", **config
 ) -> PlannerTrainer:
     defaults = dict(depth=1, d_model=32, horizon=3, batch_size=16, warmup_steps=4, learning_rate=1e-3, sampling_steps=2)
-    defaults |= dict(first_guess=False)  # test_first_guess.py has those with one
+    defaults |= dict(first_guess="none")  # test_first_guess.py has those with one
     with th.random.fork_rng(devices=[]):
         th.manual_seed(seed)
         planner = InpaintingPlanner(STATE_DIM, ACTION_DIM, max_delay, PlannerConfig(**{**defaults, **config}))
@@ -104,7 +104,7 @@ OTHER_SETTINGS = {
     "d_model": 64,
     "horizon": 4,
     "embed_known": False,
-    "first_guess": True,
+    "first_guess": "plain",
     "prediction": "epsilon",
     "schedule": "linear",
     "time_sampling": "uniform",

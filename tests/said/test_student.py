@@ -27,7 +27,7 @@ def taught():
 
     Without a first guess: on random weights it doubles how wild a function the small student has to learn.
     """
-    model = with_answers(make(planner_kwargs={"temperature": 0.0, "first_guess": False}).learn(60))
+    model = with_answers(make(planner_kwargs={"temperature": 0.0, "first_guess": "none"}).learn(60))
     model.error = model.distill(**QUICK)
     return model
 
