@@ -303,9 +303,11 @@ class InpaintingPlanner(nn.Module):
         :param state_history: (B, D, obs_dim)
         :param state_known: (B, D) bool
         """
-        length = x.shape[2]
+        length, is_old = x.shape[2], x.shape[2] > self.config.horizon
         given = inpainting.known_window(observation, action_history, delay, length, state_history)
         known = inpainting.known_mask(delay, length, self.obs_dim, self.act_dim, state_known)
+        if self.config.present == "guessed" and is_old:
+            return self._plan_from_guess(steps, value_fn, times, given, known, action_history, delay, x)
         clean = self.normalizer.normalize(*given.split(self.sizes, dim=-1))  # (B, L, obs_dim + act_dim)
         valid = self._within(delay, length).repeat_interleave(x.shape[1], 0) if is_mixed else None  # (B * N, L)
         network = self.network
@@ -333,6 +335,38 @@ class InpaintingPlanner(nn.Module):
             values = score(value_fn, self.config, states, actions, delay, shortest)
         action = choose(actions[rows, :, delay], values, self.config.choice_factor)
         return Plan(action, present, states, actions, values)
+
+    def _plan_from_guess(
+        self,
+        steps: Sequence[diffusion.SolverStep],
+        value_fn: ValueFn | None,
+        times: th.Tensor,
+        given: th.Tensor,
+        known: th.Tensor,
+        action_history: th.Tensor,
+        delay: th.Tensor,
+        x: th.Tensor,
+    ) -> Plan:
+        """Plan from the first guess's present as from an observation of age 0, and write down how it came there.
+
+        The arguments are those of :meth:`_inpaint`, and what it makes of them.
+        """
+        assert self.first_guess is not None  # for mypy: the config has seen to it
+        states, actions = given.split(self.sizes, dim=-1)  # (B, L, obs_dim), (B, L, act_dim)
+        z, longest = self.normalizer.normalize_states(states), x.shape[2] - self.config.horizon
+        guess = self.first_guess(z, actions, delay, known[..., 0], longest)[..., : self.obs_dim]
+        states = th.where(known[..., :1], states, self.normalizer.denormalize_states(guess))
+        rows, now = th.arange(len(x), device=x.device), th.zeros_like(delay)
+        ahead = x[:, :, : self.config.horizon]
+        plan = self._inpaint(steps, value_fn, 0, False, times, states[rows, delay], action_history, now, ahead)
+        step = th.arange(x.shape[2], device=x.device) - delay[:, None]  # (B, L), since the present
+        index = step.clamp(0, self.config.horizon - 1)[:, None, :, None].expand(*x.shape[:3], -1)
+        is_past = (step < 0)[:, None, :, None]
+        states, actions = (
+            th.where(is_past, past[:, None], part.gather(2, index.expand(-1, -1, -1, part.shape[-1])))
+            for past, part in ((states, plan.states), (actions, plan.actions))
+        )
+        return Plan(plan.action, plan.present, states, actions, plan.values)
 
     def _guess(self, states: th.Tensor, actions: th.Tensor, delay: th.Tensor, known: th.Tensor) -> th.Tensor | None:
         """Return what the network is shown of the first guess: (B, L, 2 * obs_dim + act_dim), z-scored, or None.

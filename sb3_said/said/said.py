@@ -197,8 +197,8 @@ class SAID(OfflineAlgorithm, StableSAC):
 
         ``model.set_planner(temperature=0.3, n_candidates=50)``
 
-        :param settings: ``sampling_steps``, ``n_candidates``, ``temperature``, ``scored_states`` or ``choice_factor``
-            of :class:`~sb3_said.planner.PlannerConfig`
+        :param settings: ``sampling_steps``, ``n_candidates``, ``temperature``, ``scored_states``, ``choice_factor`` or
+            ``present`` of :class:`~sb3_said.planner.PlannerConfig`
         :raises ValueError: for other settings, which the weights depend on, for values outside their range, and for
             ``scored_states="decision"`` where V(s) scores, in which no action shows
         """

@@ -49,6 +49,8 @@ def main(argv: list[str] | None = None) -> None:
                         "weigh among the candidates, >= 0; none: the best one alone decides")  # fmt: skip
     parser.add_argument("--scored-states", metavar="WHICH", help="states of a plan that the critics score: decision, "
                         "future or all")  # fmt: skip
+    parser.add_argument("--present", metavar="WHICH", help="where a plan starts: inpainted, with the plan, or guessed "
+                        "before it")  # fmt: skip
     parser.add_argument("--answer", choices=ANSWERS, help="who acts; both: the expert while the observation is young, "
                         "and the planner where it is older")  # fmt: skip
     parser.add_argument("--expert-up-to", type=int, metavar="AGE", help="with --answer both: the largest age at which "

@@ -56,7 +56,7 @@ def test_config_survives_json():
         ({"depth": 2.0}, "depth is 2.0, expected a whole number"),
         ({"depth": "2"}, "depth is '2', expected a whole number"),
         ({"embed_known": 1}, "embed_known is 1, expected True or False"),
-        ({"schedule": ["cosine"]}, "schedule is .'cosine'., expected a name"),
+        ({"schedule": ["cosine"]}, "schedule is .'cosine'., expected one of"),
         ({"betas": (0.9, 1.0)}, "betas is .0.9, 1.0., expected two numbers"),
         ({"ema_decay": None}, "ema_decay is None, expected a finite number"),
         ({"depth": 10**9}, "depth is 1000000000, expected at most 1000"),

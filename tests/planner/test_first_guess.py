@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch as th
 from hypothesis import given, settings
@@ -124,3 +126,53 @@ def test_decisions_of_mixed_ages_are_those_one_by_one():
         alone = planner.plan(observation[i : i + 1], history[i : i + 1], delay[i : i + 1], temperature=0.0)
         th.testing.assert_close(alone.action[0], together.action[i], atol=1e-5, rtol=1e-5)
         th.testing.assert_close(alone.present[0], together.present[i], atol=1e-5, rtol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def guessing() -> InpaintingPlanner:
+    trainer = make_trainer(precision="float32", present="guessed")
+    trainer.train(5)
+    return trainer.planner
+
+
+@th.no_grad()
+def test_a_plan_from_the_guessed_present_is_the_plan_of_who_sees_it(guessing: InpaintingPlanner):
+    generator = th.Generator().manual_seed(1)
+    observation = th.randn(D + 1, STATE_DIM, generator=generator)
+    history = 2 * th.rand(D + 1, D, ACTION_DIM, generator=generator) - 1
+    noise = th.randn(3, L, STATE_DIM + ACTION_DIM, generator=generator)
+    made = guessing.plan(observation, history, th.arange(D + 1), noise=noise, temperature=1.0)
+    assert made.states.shape == (D + 1, 3, L, STATE_DIM)
+    for d in range(D + 1):
+        past = [observation[d]]
+        for action in history[d, D - d :]:
+            z = guessing.normalizer.normalize_states(past[-1])
+            past.append(guessing.normalizer.denormalize_states(guessing.first_guess.model(z, action).clamp(-10, 10)))
+        plan = guessing.plan(past[-1][None], history[:1], th.tensor([0]), noise=noise, temperature=1.0)
+        kept = slice(d, d + HORIZON)
+        for found, expected in (
+            (made.present[d], past[-1]),
+            (made.action[d], plan.action[0]),
+            (made.states[d, :, kept], plan.states[0]),
+            (made.actions[d, :, kept], plan.actions[0]),
+            (made.states[d, :, :d], th.stack(past)[:d].expand(3, -1, -1)),
+            (made.actions[d, :, :d], history[d, D - d :].expand(3, -1, -1)),
+        ):
+            th.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
+
+
+@th.no_grad()
+def test_a_plan_from_the_guessed_present_is_another_one_and_its_candidates_are_chosen(guessing: InpaintingPlanner):
+    observation, history, delay = th.ones(2, STATE_DIM), th.ones(2, D, ACTION_DIM), th.tensor([D, D])
+    asked = dict(noise=th.randn(3, L, STATE_DIM + ACTION_DIM, generator=th.Generator().manual_seed(0)), temperature=1.0)
+    by_action = guessing.plan(observation, history, delay, lambda _, actions: actions[..., 0], **asked)
+    assert th.equal(by_action.action[:, 0], by_action.actions[:, :, D, 0].max(1).values)
+    guessing.config = replace(guessing.config, present="inpainted")
+    assert not th.allclose(guessing.plan(observation, history, delay, **asked).action, by_action.action, atol=1e-3)
+    guessing.config = replace(guessing.config, present="guessed")
+
+
+def test_without_a_guess_no_present_can_be_guessed():
+    for changes in ({"first_guess": "none"}, {"mask": "fixed"}):
+        with pytest.raises(ValueError, match="expected a first_guess"):
+            PlannerConfig(present="guessed", **changes)
