@@ -3,16 +3,17 @@
     python benchmarks/motivation.py --env Hopper-v5 --dataset medium.npz --json motivation.json --plot motivation.png
     python benchmarks/motivation.py ... --actor logs/sadr/Hopper-v5-seed1_1    # who acts on the beliefs, in BC's place
 
-Three beliefs of the present learn from the same episodes: "inpainted" is SAID's planner, "rolled out" an MLP of one
-step that is rolled out over the actions since, "regressed" an MLP that is asked for the present at once. One network of
-each serves all delays, and --plain-steps gives the plain ones as many gradient steps as they need.
+Four beliefs of the present learn from the same episodes: "inpainted" is SAID's planner, "guessed" its first guess,
+"rolled out" a network of one step that is rolled out over the actions since, as the guess's is, "regressed" an MLP that
+is asked for the present at once. One network of each serves all delays, and --plain-steps gives the plain ones as many
+gradient steps as they need.
 
 error   root mean squared error of s_t on held-out episodes, in standard deviations of the states, the same windows for
         all beliefs
 return  of one actor without delay that acts on each belief, over seeded episodes: behaviour cloning of the same
         episodes at delay 0, or --actor. Beside it "old observation", on which it acts as if nothing was delayed,
-        "SAID", whose planner decides itself, "one step", the same with one step of denoising, and "cloning": BC on
-        the augmented state
+        "SAID", whose planner decides itself, "one step", the same with one step of denoising, "from the guess", the
+        same from the guessed present, and "cloning": BC on the augmented state
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ import numpy as np
 import torch as th
 from tqdm import tqdm
 
-from sb3_said import SAID, DelayedObservationWrapper
+from sb3_said import SAID, DelayedObservationWrapper, PlannerConfig
 from sb3_said.evaluation import Summary, plots, rollout
 from sb3_said.files.atomic import write_json
 from sb3_said.offline import BC, Dataset, load_dataset, normalized_score, reference_returns
@@ -47,7 +48,8 @@ from sb3_said.zoo.runs import LoadedRun, load_run, origin
 
 N_WINDOWS = 5_000  # held out, at most
 PLAIN: dict[str, type[LearnedBelief]] = {"rolled out": RolledOutModel, "regressed": RegressedPresent}
-PLAYERS = ["inpainted", *PLAIN, "old observation", "SAID", "one step", "cloning"]
+FROM_GUESS = "from the guess"
+PLAYERS = ["inpainted", "guessed", *PLAIN, "old observation", "SAID", "one step", FROM_GUESS, "cloning"]
 
 
 def load_agent(path: str | Path, device: str = "cpu") -> LoadedRun:
@@ -125,7 +127,10 @@ def train(data: Dataset, args: argparse.Namespace) -> tuple[dict[str, Belief], A
         return bc.learn_offline(data, args.plain_steps, progress_bar=True)
 
     actor: Any = clone(task) if args.actor is None else load_agent(args.actor, args.device).model
-    beliefs: dict[str, Belief] = {"inpainted": PlannerBelief(said.policy.planner), **networks}
+    beliefs: dict[str, Belief] = {"inpainted": PlannerBelief(said.policy.planner)}
+    if "guessed" in args.players:
+        beliefs["guessed"] = PlannerBelief(said.policy.planner, "guessed")
+    beliefs |= networks
     beliefs["old observation"] = OldObservation(args.max_delay)
     return beliefs, actor, said, clone(env)
 
@@ -206,6 +211,10 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     p.add_argument("--json", type=Path)
     p.add_argument("--plot", type=Path)
     args = p.parse_args(argv)
+    if PlannerConfig(**args.planner_kwargs).first_guess == "none" and {"guessed", FROM_GUESS} & {*args.players}:
+        p.error(
+            f"A planner without a first guess guesses no present: leave 'guessed' and {FROM_GUESS!r} out of --players."
+        )
     args.max_delay = max(args.delays)
     args.plain_steps = args.plain_steps or args.gradient_steps
     th.set_num_threads(args.num_threads)
@@ -220,8 +229,10 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     document["errors"] = errors(held, beliefs, args)
     show({k: [f"{x:.3f}" for x in row] for k, row in document["errors"].items()}, "error at delay", args.delays)
     players: dict[str, Any] = {name: BeliefOnly(belief, actor, args.device) for name, belief in beliefs.items()}
-    players["SAID"] = AllAtOnce(said, sampling_steps=said.policy.planner.config.sampling_steps)
-    players["one step"] = AllAtOnce(said, sampling_steps=1)
+    steps = said.policy.planner.config.sampling_steps
+    players["SAID"] = AllAtOnce(said, sampling_steps=steps, present="inpainted")
+    players["one step"] = AllAtOnce(said, sampling_steps=1, present="inpainted")
+    players[FROM_GUESS] = AllAtOnce(said, sampling_steps=steps, present="guessed")
     players["cloning"] = cloning
     table = returns({name: players[name] for name in args.players}, args)
     show({k: [str(s.mean_return) for s in row] for k, row in table.items()}, "return at delay", args.delays)

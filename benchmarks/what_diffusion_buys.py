@@ -10,8 +10,10 @@ expert, average      the average of its weights
 cloning              a plain network from what is known under delay to the action, weighted as the planner is
 regressed present    such a network for the present, and the expert's actor for age 0 on it
 inpainted present    the planner's present, and the same actor
+guessed present      that of its first guess, and the same actor
 one step             SAID in one denoising step at temperature 0
 SAID                 SAID as its preset decides: in five steps at temperature 0
+from the guess       the same, but the plan starts at the first guess's present
 weighed              SAID whose critics weigh the candidates of two steps at temperature 1
 chosen by Q          the best of these candidates by the mean min Q(s, a) of the steps planned after the decision
 chosen by V          the same by V(s), learned on the replay by implicit Q-learning with two steps for each update
@@ -42,7 +44,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from measure import progress
-from motivation import AllAtOnce, dict_of
+from motivation import FROM_GUESS, AllAtOnce, dict_of
 from tqdm import tqdm
 
 from sb3_said import SAID, DelayedObservationWrapper, PlannerConfig
@@ -58,9 +60,10 @@ from sb3_said.said.trial import WAYS
 from sb3_said.zoo.runs import load_run
 
 EXPERT = ("expert, last", "expert, average")
-NETWORKS = ("cloning", "regressed present", "inpainted present")
+NETWORKS = ("cloning", "regressed present", "inpainted present", "guessed present")
 SETTINGS: dict[str, dict[str, Any]] = {
     "SAID": {},
+    FROM_GUESS: {"present": "guessed"},
     "one step": WAYS["one_step"],
     "weighed": WAYS["weighed"],
     "chosen by Q": {"temperature": 1.0, "sampling_steps": 2, "scored_states": "future"},
@@ -213,7 +216,11 @@ def players(model: SAID, rows: list[str], args: argparse.Namespace) -> Iterator[
                 yield "cloning", seed, regression
                 yield "regressed present", seed, BeliefOnly(regression, model)
                 yield "inpainted present", seed, BeliefOnly(PlannerBelief(policy.planner), model)
+                if f"guessed present/{seed}" in rows:
+                    yield "guessed present", seed, BeliefOnly(PlannerBelief(policy.planner, "guessed"), model)
             for row, how in SETTINGS.items():
+                if row == FROM_GUESS and f"{row}/{seed}" not in rows:
+                    continue
                 if row == "chosen by V" and f"{row}/{seed}" in rows:
                     learn_values(model, args.updates)
                 policy.planner.config = replace(preset, **how)
@@ -258,6 +265,8 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     args = p.parse_args(argv)
     th.set_num_threads(args.num_threads)
     model = open_run(args.run) if args.log is None else open_with_log(args.run, args.log)
+    if preset_of(model, args).first_guess == "none" and {"guessed present", FROM_GUESS} & {*args.rows}:
+        p.error(f"This planner has no first guess: leave 'guessed present' and {FROM_GUESS!r} out of --rows.")
     settings: dict[str, Any] = {key: getattr(args, key) for key in ("updates", "episodes", "eval_seed")}
     settings["steps"] = model.num_timesteps
     settings |= {f"planner_{name}": value for name, value in preset_of(model, args).weight_settings().items()}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -34,13 +36,16 @@ class Belief(Protocol):
 
 
 class PlannerBelief:
-    """The present as an inpainting planner decodes it.
+    """The present as an inpainting planner decodes it, or as its first guess has it.
 
     :param planner: of a trained SAID agent, ``model.policy.planner``
+    :param which: ``"inpainted"`` or ``"guessed"``
+    :raises ValueError: for a guess of a planner that has none
     """
 
-    def __init__(self, planner: InpaintingPlanner):
-        self.planner, self.max_delay = planner, planner.max_delay
+    def __init__(self, planner: InpaintingPlanner, which: str = "inpainted"):
+        self.planner, self.max_delay = copy.copy(planner), planner.max_delay  # the same weights, other settings
+        self.planner.config = replace(planner.config, present=which)
 
     def present(self, state: th.Tensor, action_history: th.Tensor, delay: th.Tensor) -> th.Tensor:
         """Return the one present that no initial noise leads to: (B, obs_dim)."""

@@ -61,8 +61,9 @@ def test_it_measures_errors_and_returns_of_each_belief(log, tmp_path, capsys):
     assert (written["held_out"], written["eval_seed"], written["terminal_penalty"]) == (0.3, 10_000, None)
     assert written["dataset"] == [str(tmp_path / "log.npz")] and written["env"] == ENV
     assert {"command", "date", "machine", "versions"} < set(written["origin"])
-    names = ["inpainted", "rolled out", "regressed", "old observation"]
-    assert list(written["errors"]) == names and list(written["returns"]) == [*names, "SAID", "one step", "cloning"]
+    names = ["inpainted", "guessed", "rolled out", "regressed", "old observation"]
+    players = [*names, "SAID", "one step", "from the guess", "cloning"]
+    assert list(written["errors"]) == names and list(written["returns"]) == players
     for name, (now, later) in written["errors"].items():
         assert later > 0 and (now < 1e-6 or name == "regressed")  # which is asked at delay 0, too
     at_0 = {name: tuple(row[0]["returns"]) for name, row in written["returns"].items()}
@@ -74,4 +75,7 @@ def test_it_measures_errors_and_returns_of_each_belief(log, tmp_path, capsys):
         *("--players", "SAID", "inpainted"),
     ])  # fmt: skip
     assert list(some["errors"]) == ["inpainted", "old observation"]
+    with pytest.raises(SystemExit):
+        motivation.main(["--dataset", str(tmp_path / "log.npz"), "--planner-kwargs", "first_guess=none"])
+    assert "leave 'guessed' and 'from the guess' out" in capsys.readouterr().err
     assert some["returns"] == {name: made["returns"][name] for name in ("SAID", "inpainted")}

@@ -90,8 +90,10 @@ def test_a_planners_belief_repeats_and_keeps_what_is_known():
     present = belief.present(state, history, delay)
     th.testing.assert_close(belief.present(state, history, delay), present, rtol=0, atol=0)
     th.testing.assert_close(present[0], state[0])  # nothing is hidden at age 0
-    plan = planner.plan(state, history, delay, n_candidates=1, temperature=0.0)
+    guessed = PlannerBelief(planner, "guessed").present(state, history, delay)
+    plan = planner.plan(state, history, delay, n_candidates=1, temperature=0.0)  # as it was set before
     th.testing.assert_close(present, plan.states[th.arange(6), 0, delay])
+    assert th.equal(guessed[0], state[0]) and (guessed[delay > 0] - present[delay > 0]).abs().min(1).values.max() > 1e-3
 
 
 def test_no_window_reaches_a_delay_that_no_episode_does():
