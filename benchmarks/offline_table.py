@@ -29,7 +29,9 @@ DELAYS = (0, 4, 8, 16)
 NAMES = {
     "SAID": "SAID",
     "one step": "SAID, one step",
+    "from the guess": "SAID, from the guess",
     "inpainted": "belief-only",
+    "guessed": "belief-only, guessed present",
     "cloning": "BC",
     "rolled out": "belief-only, rolled-out model",
 }
