@@ -158,11 +158,13 @@ def print_table(played: list[tuple[str, Summary]], env_id: str = "") -> None:
     heads = [f"{names[kind]:>12} {'95 % interval':>24} {'score':>7} {'length':>8}" for kind in kinds]
     print(f"{'':{width}} {' '.join(heads)}   decision latency")
     for label, row in table.items():
-        columns = " ".join(_columns(row[kind], env_id) for kind in kinds)
-        print(f"{label:{width}} {columns}   {row[kinds[0]].latency or 'not measured'}")
+        columns = " ".join(_columns(row.get(kind), env_id) for kind in kinds)
+        print(f"{label:{width}} {columns}   {next(iter(row.values())).latency or 'not measured'}")
 
 
-def _columns(summary: Summary, env_id: str) -> str:
+def _columns(summary: Summary | None, env_id: str) -> str:
+    if summary is None:  # who could not answer yet when the best one was saved
+        return f"{'-':>12} {'-':>24} {'-':>7} {'-':>8}"
     mean, scores = summary.mean_return, score_of(summary, env_id)
     interval = f"[{mean.low:,.1f}, {mean.high:,.1f}]"
     score = "-" if scores is None else f"{scores[0]:.1f}"

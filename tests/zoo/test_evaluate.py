@@ -282,3 +282,11 @@ def test_an_agent_that_reads_a_state_history_plays_without_its_run_folder(tmp_pa
     run = load_run(str(tmp_path / "agent.zip"), "said", ENV, delay=1)
     assert set(run.make_env().observation_space.spaces) >= {"state_history", "state_known"}
     assert rollout(run.model, run.make_env, 1, seed=0).lengths[0] > 0
+
+
+def test_who_is_missing_in_the_best_agent_leaves_its_columns_empty(capsys: pytest.CaptureFixture[str]) -> None:
+    planner, expert = (evaluate.Summary.from_episodes(who, [1.0, 3.0], [5, 5]) for who in ("planner", "expert"))
+    evaluate.print_table([("last", planner), ("last", expert), ("best", expert)])
+    _, first, second = capsys.readouterr().out.splitlines()
+    assert first.split("   ")[0].split()[0] == "planner" and first.split()[-6:-2] == ["-"] * 4
+    assert second.split().count("2.0") == 2 and len(first) == len(second)
