@@ -219,9 +219,9 @@ def players(model: SAID, rows: list[str], args: argparse.Namespace) -> Iterator[
                 if f"guessed present/{seed}" in rows:
                     yield "guessed present", seed, BeliefOnly(PlannerBelief(policy.planner, "guessed"), model)
             for row, how in SETTINGS.items():
-                if row == FROM_GUESS and f"{row}/{seed}" not in rows:
+                if f"{row}/{seed}" not in rows:
                     continue
-                if row == "chosen by V" and f"{row}/{seed}" in rows:
+                if row == "chosen by V":
                     learn_values(model, args.updates)
                 policy.planner.config = replace(preset, **how)
                 with policy.answering("planner"):

@@ -15,15 +15,15 @@ from sb3_said.planner.values import VALUE_SCALES
 SAMPLING_SETTINGS = ("sampling_steps", "n_candidates", "temperature", "scored_states", "choice_factor", "present")
 CHOICES: dict[str, tuple[str, ...]] = {
     "first_guess": ("residual", "plain", "none"),
-    "prediction": tuple(PREDICTIONS),
-    "schedule": tuple(SCHEDULES),
-    "time_sampling": tuple(TIME_SAMPLINGS),
+    "prediction": PREDICTIONS,
+    "schedule": SCHEDULES,
+    "time_sampling": TIME_SAMPLINGS,
     "mask": ("random", "fixed"),
     "action_transform": ("standard", "tanh"),
     "scored_states": ("future", "decision", "all"),
     "present": ("inpainted", "guessed"),
     "lr_schedule": ("cosine", "constant"),
-    "value_scale": tuple(VALUE_SCALES),
+    "value_scale": VALUE_SCALES,
     "precision": ("auto", "float32", "bfloat16"),
 }
 #: Far beyond what helps: a setting above is a slip, and would ask for memory or hours.

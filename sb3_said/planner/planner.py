@@ -351,11 +351,11 @@ class InpaintingPlanner(nn.Module):
 
         The arguments are those of :meth:`_inpaint`, and what it makes of them.
         """
-        assert self.first_guess is not None  # for mypy: the config has seen to it
         states, actions = given.split(self.sizes, dim=-1)  # (B, L, obs_dim), (B, L, act_dim)
-        z, longest = self.normalizer.normalize_states(states), x.shape[2] - self.config.horizon
-        guess = self.first_guess(z, actions, delay, known[..., 0], longest)[..., : self.obs_dim]
-        states = th.where(known[..., :1], states, self.normalizer.denormalize_states(guess))
+        guess = self._guess(states, actions, delay, known)
+        assert guess is not None  # for mypy: the config has seen to it
+        guessed = self.normalizer.denormalize_states(guess[..., : self.obs_dim])
+        states = th.where(known[..., :1], states, guessed)
         rows, now = th.arange(len(x), device=x.device), th.zeros_like(delay)
         ahead = x[:, :, : self.config.horizon]
         plan = self._inpaint(steps, value_fn, 0, False, times, states[rows, delay], action_history, now, ahead)

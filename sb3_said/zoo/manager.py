@@ -245,7 +245,8 @@ class DelayedExperimentManager(ExperimentManager):
         resumes = self.checkpoint.exists()
         if resumes:
             with ending_training(SavedFileError):
-                restore_training(model, self.checkpoint, CallbackList(self.callbacks))  # type: ignore[arg-type]
+                callbacks = CallbackList(self.callbacks)
+                restore_training(model, self.checkpoint, callbacks)  # type: ignore[arg-type]  # one of ALGORITHMS
             print(f"Resuming {self.save_path} at step {model.num_timesteps}")
             drop_undone_episodes(self.folder, model.num_timesteps // model.n_envs)
         taken = model.num_timesteps if resumes else 0  # learn() counts the steps of an agent given with -i anew

@@ -81,12 +81,11 @@ def main(argv: list[str] | None = None) -> None:
     table = make_table(shown, rows)
     order = delays or list(dict.fromkeys(cell.delay for cell in shown))
     in_order = sorted(shown, key=lambda cell: (cell.age_error != 0, order.index(cell.delay), cell.age_error))
-    columns = list(dict.fromkeys(cell.column for cell in in_order))
+    columns, settings = list(dict.fromkeys(cell.column for cell in in_order)), Results(args.json).settings
     print_table(table, columns)
-    print_scores(table, columns, Results(args.json).settings["env"])
+    print_scores(table, columns, settings["env"])
     print_manners(shown, rows)
     if args.plot is not None and any(table.values()):
-        settings = Results(args.json).settings
         title = f"{settings['env']} under delay: means of {settings['n_episodes']} episodes, 95 % intervals"
         told_right = {row: {c: x for c, x in of_row.items() if AGE not in str(c)} for row, of_row in table.items()}
         plots.save(plots.plot_over_delays(told_right, title)[0], args.plot)
