@@ -58,6 +58,7 @@ class LearnedBelief(nn.Module):
     :param max_delay: D, the largest delay
     """
 
+    learning_rate = 1e-3  # of Adam
     mean: th.Tensor
     std: th.Tensor
 
@@ -90,6 +91,8 @@ class LearnedBelief(nn.Module):
 
 class RolledOutModel(LearnedBelief):
     """A model of one step, (s, a) to s', which is rolled out over the actions since: its errors compound."""
+
+    learning_rate = OneStepModel.learning_rate
 
     def __init__(self, obs_dim: int, act_dim: int, max_delay: int):
         super().__init__(obs_dim, max_delay)
@@ -158,11 +161,10 @@ def train_belief(
     source: WindowSource,
     gradient_steps: int,
     batch_size: int = 256,
-    learning_rate: float = 1e-3,
     seed: int = 0,
     progress_bar: bool = False,
 ) -> None:
-    """Train a belief with Adam, whose rate falls to 0 by a cosine.
+    """Train a belief with Adam, whose rate falls from the belief's own to 0 by a cosine.
 
     :param belief: to train, on its own device
     :param source: windows of true states, such as ``model.replay_buffer.window_source()``
@@ -171,7 +173,7 @@ def train_belief(
     """
     device, generator = belief.mean.device, th.Generator().manual_seed(seed)
     belief.fit_scale(source.start_states().to(device))
-    optimizer = th.optim.Adam(belief.parameters(), learning_rate)
+    optimizer = th.optim.Adam(belief.parameters(), belief.learning_rate)
     scheduler = th.optim.lr_scheduler.CosineAnnealingLR(optimizer, gradient_steps)
     for _ in tqdm(range(gradient_steps), desc=type(belief).__name__, disable=not progress_bar):
         windows = source.sample(batch_size, belief.max_delay + 1, generator).to(device)

@@ -15,7 +15,7 @@ from sb3_said.planner.values import window_weight
 from sb3_said.replay.windows import WindowSource
 
 CLONE_WIDTH = 256
-MODEL_LEARNING_RATE, CLONE_LEARNING_RATE = 3e-3, 1e-3
+CLONE_LEARNING_RATE = 1e-3
 BATCH_SIZE = 256
 # Standard deviations: a model that is asked far from its data must not run away. A log without noise has falls at 31
 FARTHEST = 100.0
@@ -95,7 +95,7 @@ def fit_first_guess(
     """
     guess.model.move_std.copy_(normalizer.move_std[0])
     groups: list[dict[str, Any]] = [
-        {"params": [*guess.model.parameters()], "lr": MODEL_LEARNING_RATE},
+        {"params": [*guess.model.parameters()], "lr": OneStepModel.learning_rate},
         {"params": [*guess.clone.parameters()], "lr": CLONE_LEARNING_RATE},
     ]
     optimizer = th.optim.Adam(groups, fused=True)

@@ -37,6 +37,7 @@ class OneStepModel(nn.Module):
     :param is_residual: two residual blocks of 256, or two plain layers of 512
     """
 
+    learning_rate = 3e-3  # of Adam, results/nine_logs.md has others
     move_std: th.Tensor  # (obs_dim,), set it to how far z-scored states move in a step
 
     def __init__(self, obs_dim: int, act_dim: int, is_residual: bool = True) -> None:

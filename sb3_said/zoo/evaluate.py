@@ -91,8 +91,7 @@ def main(argv: list[str] | None = None) -> None:
                 in_time = evaluate_in_real_time(one, answer, args.episodes, args.seed, period, not args.stochastic)
                 for summary, counts in in_time:
                     played.append((which, summary))
-                    counted[summary.label if which == "last" else f"{summary.label}, best"] = counts
-    rows = [replace(s, label=s.label if which == "last" else f"{s.label}, best") for which, s in played]
+                    counted[label_of(which, summary)] = counts
     print_table(played, run.info["env"])
     for label, counts in counted.items():
         print(f"{label}: {', '.join(f'{name} {value:g}' for name, value in counts.items() if 'gap' not in name)}")
@@ -109,6 +108,7 @@ def main(argv: list[str] | None = None) -> None:
     write_json(target, document)
     print(f"Wrote {target}")
     if args.plot is not None:
+        rows = [replace(summary, label=label_of(which, summary)) for which, summary in played]
         draw(args.plot, rows, run.folder, f"{run.info['algo']} on {run.info['env']}, delay {run.info['delay']}")
         print(f"Wrote {args.plot}")
 
@@ -132,6 +132,11 @@ def evaluate(
             latency = measure_latency(run.model, observations, latency_calls, deterministic, run.normalize)
     measured = played.terminated, played.action_changes
     return Summary.from_episodes(label, played.returns, played.lengths, latency, *measured)
+
+
+def label_of(which: str, summary: Summary) -> str:
+    """Return the label under which the last and the best agent can stand in one list."""
+    return summary.label if which == "last" else f"{summary.label}, {which}"
 
 
 def score_of(summary: Summary, env_id: str) -> list[float] | None:

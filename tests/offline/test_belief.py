@@ -45,7 +45,7 @@ def source():
 def learned(request, source):
     th.manual_seed(0)
     belief = request.param(2, 1, DELAY)
-    train_belief(belief, source, 300, learning_rate=3e-3)
+    train_belief(belief, source, 400)
     return belief
 
 
