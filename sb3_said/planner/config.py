@@ -14,7 +14,7 @@ from sb3_said.planner.values import VALUE_SCALES
 #: Settings that shape a planner's answers and none of its weights.
 SAMPLING_SETTINGS = ("sampling_steps", "n_candidates", "temperature", "scored_states", "choice_factor", "present")
 CHOICES: dict[str, tuple[str, ...]] = {
-    "first_guess": ("residual", "plain", "none"),
+    "first_guess": ("residual", "prior", "plain", "none"),
     "prediction": PREDICTIONS,
     "schedule": SCHEDULES,
     "time_sampling": TIME_SAMPLINGS,
@@ -48,8 +48,9 @@ class PlannerConfig:
     # Show the network what plain networks make of what is known: the states since by a model of one step, and a clone's
     # action. Measured on logs: twice the return at delays 4 to 16 (results/offline.md). "residual": the model has two
     # residual blocks of 256, which know the next state a quarter better in the same time than the two layers of 512 of
-    # "plain" do, and make HalfCheetah-v5 run under delay (results/nine_logs.md); or "none" (paper). Files saved before
-    # there was a choice have True and False, for "plain" and "none"
+    # "plain" do (results/nine_logs.md). "prior": and the network predicts only what this guess does not; measured on
+    # two logs, and not yet on replay of an expert, so it is no default. "none" is the paper's. Files saved before there
+    # was a choice have True and False, for "plain" and "none"
     first_guess: str = "residual"
     # Diffusion
     prediction: str = "v"  # measured: safe with few steps; or "epsilon" (paper)
@@ -113,7 +114,7 @@ class PlannerConfig:
         if self.present == "guessed" and (self.first_guess == "none" or self.mask == "fixed"):
             raise ValueError(
                 f"present is 'guessed' with first_guess={self.first_guess!r} and mask={self.mask!r}; expected a "
-                "first_guess, 'residual' or 'plain', and mask='random', by which the planner knows age 0."
+                "first_guess and mask='random', by which the planner knows age 0."
             )
         object.__setattr__(self, "betas", tuple(self.betas))  # JSON gives a list back
         at_least = {"depth": 1, "horizon": 2, "sampling_steps": 1, "n_candidates": 1, "batch_size": 1}

@@ -51,6 +51,24 @@ def to_clean(
     return (x - sigma * output) / alpha if prediction == "epsilon" else alpha * x - sigma * output
 
 
+def gaussian_prediction(
+    x: th.Tensor,
+    mean: th.Tensor,
+    std: th.Tensor,
+    alpha: float | th.Tensor,
+    sigma: float | th.Tensor,
+    prediction: str,
+) -> tuple[th.Tensor, th.Tensor]:
+    """Return the best prediction at a noisy sample x if clean entries are of N(mean, std^2), and how far it is off.
+
+    The latter is a standard deviation. For v and N(0, 1) they are 0 and 1. Arguments broadcast.
+    """
+    variance = alpha**2 * std**2 + sigma**2  # of x
+    if prediction == "epsilon":
+        return sigma / variance * (x - alpha * mean), alpha * std / variance**0.5
+    return sigma / variance * (alpha * (1 - std**2) * x - mean), std / variance**0.5
+
+
 def draw_times(
     n: int,
     schedule: str,

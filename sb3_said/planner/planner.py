@@ -17,6 +17,7 @@ from sb3_said.planner.first_guess import FirstGuess
 from sb3_said.planner.graphs import RecordedFunction
 from sb3_said.planner.normalizer import Normalizer
 from sb3_said.planner.precision import autocast
+from sb3_said.planner.prior import Prior
 from sb3_said.planner.selection import ValueFn, choose, score
 from sb3_said.replay.windows import Windows
 
@@ -70,9 +71,11 @@ class InpaintingPlanner(nn.Module):
             config.extra_state_probability > 0,
             config.first_guess != "none",
         )
-        self.first_guess = None
+        self.first_guess = self.prior = None
         if config.first_guess != "none":
-            self.first_guess = FirstGuess(obs_dim, act_dim, config.first_guess == "residual")
+            self.first_guess = FirstGuess(obs_dim, act_dim, config.first_guess != "plain")
+        if config.first_guess == "prior":
+            self.prior = Prior(max_delay, self.window_length, obs_dim + act_dim)
         self.normalizer = Normalizer(
             obs_dim, act_dim, self.window_length, config.action_transform, config.relative_states
         )
@@ -115,6 +118,21 @@ class InpaintingPlanner(nn.Module):
         self.normalizer.fit(states, actions)
         if windows is not None:
             self.normalizer.fit_moves(windows.to(self.device))
+
+    def fit_prior(self, windows: Windows) -> None:
+        """Learn how far a trained first guess is right, for ``config.first_guess="prior"``.
+
+        :param windows: of ``window_length`` steps
+        """
+        assert self.prior is not None
+        states, actions, valid, _ = windows.to(self.device)
+        clean, length = self.normalizer.normalize(states, actions), self.window_length
+        for d in range(self.max_delay + 1):
+            delay = th.full((len(states),), d, device=self.device)
+            known = inpainting.known_mask(delay, length, self.obs_dim, self.act_dim)
+            guess = self._guess(states, actions, delay, known)
+            assert guess is not None  # for mypy: there is no prior without
+            self.prior.fit(d, self._in_units(guess), clean, valid & self._within(delay, length))
 
     def loss(
         self,
@@ -162,11 +180,12 @@ class InpaintingPlanner(nn.Module):
         x = th.where(known, clean, alpha * clean + sigma * noise)
         with autocast(config.precision, device):
             output = self.network(x, self.network.context(clean, known, guess), self.network.modulations(t), valid)
+        output = self._from_prior(output.float(), x, self._expect(guess, delay), alpha, sigma)
         target = diffusion.prediction_target(clean, noise, alpha, sigma, config.prediction)
         learned = valid[..., None] & ~known
         decision = th.arange(length, device=device) == delay[:, None]  # (B, L)
         share = th.where(decision[..., None], config.decision_weight, 1.0) * learned  # (B, L, obs_dim + act_dim)
-        error = th.where(learned, (output.float() - target) ** 2, 0.0) * share
+        error = th.where(learned, (output - target) ** 2, 0.0) * share
         if weight is not None:
             error = error * weight[:, None, None]
         return error.sum() / share.sum().clamp(min=1)
@@ -314,16 +333,19 @@ class InpaintingPlanner(nn.Module):
         modulations = network.modulations(times)  # (n_steps, 6 * depth + 2, d_model)
         guess = self._guess(given[..., : self.obs_dim], given[..., self.obs_dim :], delay, known)
         context = network.context(clean, known, guess)
+        expected = self._expect(guess, delay)
+        if expected is not None:
+            expected = expected[0][:, None], expected[1][:, None]  # (B, 1, L, obs_dim + act_dim)
+
+        def predict(x: th.Tensor, i: int) -> th.Tensor:
+            output = network(x.flatten(0, 1), context, modulations[i], valid).float().view_as(x)
+            return self._from_prior(output, x, expected, steps[i].alpha, steps[i].sigma)
+
         # Of the largest age, so that decisions at all ages have one number format
         size = x.shape[0] * x.shape[1] * self.window_length * self.config.d_model
         with autocast(self.config.precision, x.device, size):
-            x = diffusion.solve(
-                lambda x, i: network(x.flatten(0, 1), context, modulations[i], valid).float().view_as(x),
-                x,
-                steps,
-                self.config.prediction,
-                impose=lambda x: th.where(known[:, None], clean[:, None], x),
-            )
+            impose = lambda x: th.where(known[:, None], clean[:, None], x)  # noqa: E731
+            x = diffusion.solve(predict, x, steps, self.config.prediction, impose)
         # Known entries come back as given, without the normaliser's rounding
         x = th.where(known[:, None], given[:, None], th.cat(self.normalizer.denormalize(x), dim=-1))
         states, actions = x.split(self.sizes, dim=-1)
@@ -378,6 +400,29 @@ class InpaintingPlanner(nn.Module):
         z = self.normalizer.normalize_states(states)
         guess = self.first_guess(z, actions, delay, known[..., 0], longest=z.shape[1] - self.config.horizon)
         return th.cat([guess, guess[..., : self.obs_dim] - z[:, :1]], dim=-1)
+
+    def _in_units(self, guess: th.Tensor) -> th.Tensor:
+        """Return what :meth:`_guess` returns as a window in the planner's units: (B, L, obs_dim + act_dim)."""
+        z, actions, _ = guess.split([*self.sizes, self.obs_dim], dim=-1)
+        return self.normalizer.normalize(self.normalizer.denormalize_states(z), actions)
+
+    def _expect(self, guess: th.Tensor | None, delay: th.Tensor) -> tuple[th.Tensor, th.Tensor] | None:
+        """Return the prior's mean and standard deviation of each entry, (B, L, obs_dim + act_dim), if there is one."""
+        return None if self.prior is None or guess is None else self.prior(self._in_units(guess), delay)
+
+    def _from_prior(
+        self,
+        output: th.Tensor,
+        x: th.Tensor,
+        expected: tuple[th.Tensor, th.Tensor] | None,
+        alpha: float | th.Tensor,
+        sigma: float | th.Tensor,
+    ) -> th.Tensor:
+        """Return the prediction at noisy windows x, which the network gives as what the prior is off by."""
+        if expected is None:
+            return output
+        best, off = diffusion.gaussian_prediction(x, *expected, alpha, sigma, prediction=self.config.prediction)
+        return best + off * output
 
     def _within(self, delay: th.Tensor, length: int) -> th.Tensor:
         """Tell which steps a window of each delay has, d + horizon of them: (B, L) bool."""

@@ -24,6 +24,7 @@ from sb3_said.replay.windows import Windows, WindowSource
 HELD_OUT_WINDOWS = 1024  # per delay, in evaluate(): tells errors that differ by 2 % apart
 YARDSTICK_LEARNING_RATE = 1e-3
 N_NORMALIZER_WINDOWS = 10_000  # enough for a standard deviation to a percent
+N_PRIOR_WINDOWS = 1_000  # each is guessed at every age
 # Of the plain networks of a first guess, before the planner's: up to a minute and a half on one core, a fifth of the
 # time of 4,000 updates of the planner
 GUESS_UPDATES, GUESS_UPDATES_EACH = 20_000, 5
@@ -185,7 +186,10 @@ class PlannerTrainer:
         n_updates = min(GUESS_UPDATES, GUESS_UPDATES_EACH * self.gradient_steps)
         drawn = self.average.normalizer, self.config, n_updates, self.generator, progress_bar
         fit_first_guess(guess, self.source, *drawn)
-        self.average.first_guess.load_state_dict(guess.requires_grad_(False).state_dict())
+        guess.requires_grad_(False)
+        if self.online.prior is not None:
+            self.online.fit_prior(self.source.sample(N_PRIOR_WINDOWS, self.online.window_length, self.generator))
+        self.average.load_state_dict(self.online.state_dict())
         self._has_guessed = True
 
     def _descend(self) -> tuple[th.Tensor]:

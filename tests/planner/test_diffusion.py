@@ -68,6 +68,28 @@ def test_predictions_give_back_what_the_sample_was_made_of(prediction, t, clean,
     th.testing.assert_close(diffusion.to_clean(target, x, alpha, sigma, prediction), clean, atol=1e-9, rtol=1e-9)
 
 
+@pytest.mark.parametrize("prediction", diffusion.PREDICTIONS)
+@pytest.mark.parametrize("schedule", diffusion.SCHEDULES)
+def test_the_best_prediction_for_gaussian_data_and_how_far_it_is_off(prediction, schedule):
+    steps = diffusion.solver_steps(schedule, 6)
+    generator = th.Generator().manual_seed(0)
+    clean, noise = (th.randn(20_000, 3, generator=generator, dtype=th.float64) for _ in range(2))
+    clean = MEAN + STD * clean
+    for i, step in enumerate(steps):
+        x = step.alpha * clean + step.sigma * noise
+        best, off = diffusion.gaussian_prediction(x, MEAN, STD, step.alpha, step.sigma, prediction)
+        th.testing.assert_close(best, gaussian_predictor(steps, prediction)(x, i), atol=1e-9, rtol=1e-9)
+        target = diffusion.prediction_target(clean, noise, *(th.tensor(f) for f in step[1:3]), prediction)
+        th.testing.assert_close((target - best).square().mean(0).sqrt(), off.expand(3), atol=0, rtol=0.02)
+
+
+def test_standard_normal_data_leave_a_prediction_of_v_as_it_is():
+    x, one = th.randn(5), th.ones(5)
+    best, off = diffusion.gaussian_prediction(x, 0 * one, one, 0.6, 0.8, "v")
+    th.testing.assert_close(best, 0 * one)
+    th.testing.assert_close(off, one)
+
+
 @pytest.mark.parametrize("time_sampling", diffusion.TIME_SAMPLINGS)
 @pytest.mark.parametrize("schedule", diffusion.SCHEDULES)
 def test_training_times_fill_their_range(time_sampling, schedule):

@@ -24,6 +24,7 @@ CONFIG = PlannerConfig(
     temperature=0.5,
     precision="float32",
     scored_states="future",
+    first_guess="prior",
 )
 LENGTH = DELAY + CONFIG.horizon
 
@@ -36,6 +37,9 @@ def make_planner(**changes):
         for layer in (planner.network.modulation, planner.network.out):
             th.nn.init.normal_(layer.weight, std=0.1)
         planner.fit_normalizer(3 + 2 * th.randn(50, OBS), th.rand(50, ACT) * 2 - 1)
+        if planner.prior is not None:
+            planner.prior.slope.uniform_(0.0, 1.0)
+            planner.prior.std.uniform_(0.1, 1.0)
     return planner.requires_grad_(False)
 
 
@@ -112,14 +116,21 @@ def naive_plan(planner, observation, history, d, noise):
     clean = planner.normalizer.normalize(given[:, :OBS], given[:, OBS:])
     guess = naive_guess(planner, observation, history, d)
     context = planner.network.context(clean[None], known[None], guess[None])[0]
+    guessed = planner.normalizer.denormalize_states(guess[:, :OBS])
+    mean = planner.prior.slope[d, :length] * planner.normalizer.normalize(guessed, guess[:, OBS : OBS + ACT])
+    std = planner.prior.std[d, :length]
     windows = []
     for x in planner.config.temperature * noise[:, :length]:
         x = th.where(known, clean, x)
         for now, after in itertools.pairwise(times):
-            v = naive_network(planner.network, x, context, now.float())
+            output = naive_network(planner.network, x, context, now.float())
             (alpha, sigma), (alpha_next, sigma_next) = (
                 (math.cos(math.pi / 2 * float(s)), math.sin(math.pi / 2 * float(s))) for s in (now, after)
             )
+            # Of the prior, the clean window's best guess at x and its deviation (Bayes), and both in terms of v
+            variance = alpha**2 * std**2 + sigma**2
+            best, off = mean + alpha * std**2 / variance * (x - alpha * mean), std * sigma / variance.sqrt()
+            v = (alpha * x - best) / sigma + off / sigma * output
             x = alpha_next * (alpha * x - sigma * v) + sigma_next * (sigma * x + alpha * v)
             x = th.where(known, clean, x)
         windows.append(x)

@@ -1,0 +1,55 @@
+"""What a first guess says of a window before the network is asked."""
+
+from __future__ import annotations
+
+import torch as th
+from torch import nn
+
+LEAST_STD = 0.01  # of a guess that is never wrong; in the planner's units
+
+
+class Prior(nn.Module):
+    """Takes each entry of a window for a draw from N(slope * guess, std^2), delay by delay and step by step.
+
+    The network adds to the best prediction for that, in units of how far it is off. So a planner begins as good as its
+    guess, and hardly moves what the guess is sure of. It is the preconditioning of Karras et al. 2022
+    (https://arxiv.org/abs/2206.00364, section 5), which has a mean of 0 and one deviation for all.
+
+    Until :meth:`fit` it is N(0, 1), which changes nothing of a prediction of v.
+
+    :param max_delay: D
+    :param length: L, steps of the longest window
+    :param n_entries: of a step, obs_dim + act_dim
+    """
+
+    slope: th.Tensor
+    std: th.Tensor
+
+    def __init__(self, max_delay: int, length: int, n_entries: int) -> None:
+        super().__init__()
+        self.register_buffer("slope", th.zeros(max_delay + 1, length, n_entries))
+        self.register_buffer("std", th.ones(max_delay + 1, length, n_entries))
+
+    @th.no_grad()
+    def fit(self, delay: int, guess: th.Tensor, clean: th.Tensor, valid: th.Tensor) -> None:
+        """Learn by least squares how far guesses of one delay are right.
+
+        :param guess: (M, L, n_entries), as of the next two in the planner's units
+        :param clean: (M, L, n_entries), what they turned out to be
+        :param valid: (M, L) bool; steps that no window has stay as they are
+        """
+        share = valid[..., None] / valid.sum(0).clamp(min=1)[:, None]  # (M, L, 1)
+        slope = (share * guess * clean).sum(0) / (share * guess**2).sum(0).clamp(min=1e-12)
+        std = (share * (clean - slope * guess) ** 2).sum(0).sqrt().clamp(min=LEAST_STD)
+        is_seen = valid.any(0)[:, None]
+        self.slope[delay] = th.where(is_seen, slope, self.slope[delay])
+        self.std[delay] = th.where(is_seen, std, self.std[delay])
+
+    def forward(self, guess: th.Tensor, delay: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Return mean and standard deviation of each entry: (B, L', n_entries), both.
+
+        :param guess: (B, L', n_entries), L' at most L
+        :param delay: (B,) int64
+        """
+        length = guess.shape[1]
+        return self.slope[delay, :length] * guess, self.std[delay, :length]
