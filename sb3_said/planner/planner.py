@@ -341,10 +341,12 @@ class InpaintingPlanner(nn.Module):
             output = network(x.flatten(0, 1), context, modulations[i], valid).float().view_as(x)
             return self._from_prior(output, x, expected, steps[i].alpha, steps[i].sigma)
 
+        def impose(x: th.Tensor) -> th.Tensor:
+            return th.where(known[:, None], clean[:, None], x)
+
         # Of the largest age, so that decisions at all ages have one number format
         size = x.shape[0] * x.shape[1] * self.window_length * self.config.d_model
         with autocast(self.config.precision, x.device, size):
-            impose = lambda x: th.where(known[:, None], clean[:, None], x)  # noqa: E731
             x = diffusion.solve(predict, x, steps, self.config.prediction, impose)
         # Known entries come back as given, without the normaliser's rounding
         x = th.where(known[:, None], given[:, None], th.cat(self.normalizer.denormalize(x), dim=-1))
