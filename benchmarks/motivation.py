@@ -12,8 +12,8 @@ error   root mean squared error of s_t on held-out episodes, in standard deviati
         all beliefs
 return  of one actor without delay that acts on each belief, over seeded episodes: behaviour cloning of the same
         episodes at delay 0, or --actor. Beside it "old observation", on which it acts as if nothing was delayed,
-        "SAID", whose planner decides itself, "one step", the same with one step of denoising, "from the guess", the
-        same from the guessed present, and "cloning": BC on the augmented state
+        "SAID", whose planner decides itself, "one step", the same with one step of denoising, "SAID, inpainting", the
+        same as SAID with its present inpainted, and "cloning": BC on the augmented state
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ from sb3_said.zoo.runs import LoadedRun, load_run, origin
 
 N_WINDOWS = 5_000  # held out, at most
 PLAIN: dict[str, type[LearnedBelief]] = {"rolled out": RolledOutModel, "regressed": RegressedPresent}
-FROM_GUESS = "from the guess"
-PLAYERS = ["inpainted", "guessed", *PLAIN, "old observation", "SAID", "one step", FROM_GUESS, "cloning"]
+INPAINTING = "SAID, inpainting"
+PLAYERS = ["inpainted", "guessed", *PLAIN, "old observation", "SAID", "one step", INPAINTING, "cloning"]
 
 
 def load_agent(path: str | Path, device: str = "cpu") -> LoadedRun:
@@ -211,10 +211,11 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     p.add_argument("--json", type=Path)
     p.add_argument("--plot", type=Path)
     args = p.parse_args(argv)
-    if PlannerConfig(**args.planner_kwargs).first_guess == "none" and {"guessed", FROM_GUESS} & {*args.players}:
-        p.error(
-            f"A planner without a first guess guesses no present: leave 'guessed' and {FROM_GUESS!r} out of --players."
-        )
+    config = PlannerConfig(**args.planner_kwargs)
+    if config.mask == "none":
+        p.error("A planner with mask=none inpaints no present, which is what is compared here; give another mask.")
+    if config.first_guess == "none" and "guessed" in args.players:
+        p.error("A planner without a first guess guesses no present: leave 'guessed' out of --players.")
     args.max_delay = max(args.delays)
     args.plain_steps = args.plain_steps or args.gradient_steps
     th.set_num_threads(args.num_threads)
@@ -229,10 +230,10 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     document["errors"] = errors(held, beliefs, args)
     show({k: [f"{x:.3f}" for x in row] for k, row in document["errors"].items()}, "error at delay", args.delays)
     players: dict[str, Any] = {name: BeliefOnly(belief, actor, args.device) for name, belief in beliefs.items()}
-    steps = said.policy.planner.config.sampling_steps
-    players["SAID"] = AllAtOnce(said, sampling_steps=steps, present="inpainted")
-    players["one step"] = AllAtOnce(said, sampling_steps=1, present="inpainted")
-    players[FROM_GUESS] = AllAtOnce(said, sampling_steps=steps, present="guessed")
+    own = said.policy.planner.config
+    players["SAID"] = AllAtOnce(said, sampling_steps=own.sampling_steps, present=own.present)
+    players["one step"] = AllAtOnce(said, sampling_steps=1, present=own.present)
+    players[INPAINTING] = AllAtOnce(said, sampling_steps=own.sampling_steps, present="inpainted")
     players["cloning"] = cloning
     table = returns({name: players[name] for name in args.players}, args)
     show({k: [str(s.mean_return) for s in row] for k, row in table.items()}, "return at delay", args.delays)

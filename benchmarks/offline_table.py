@@ -29,7 +29,7 @@ DELAYS = (0, 4, 8, 16)
 NAMES = {
     "SAID": "SAID",
     "one step": "SAID, one step",
-    "from the guess": "SAID, from the guess",
+    "SAID, inpainting": "SAID, inpainting",
     "inpainted": "belief-only",
     "guessed": "belief-only, guessed present",
     "cloning": "BC",

@@ -152,7 +152,7 @@ def measure_setting(setting: Setting, rounds: int, device: str, rates: dict[str,
     obs = observe(env, setting.delay)
     plain = make_plain(setting, device, env)
     config = setting.config
-    guessing = make_agent(setting._replace(config=replace(config, first_guess="residual")), device)
+    guessing = make_agent(setting._replace(config=replace(config, first_guess="prior", present="guessed")), device)
     work = f"{config.sampling_steps} steps, {setting.n_candidates} candidate{'s' if setting.n_candidates > 1 else ''}"
     name = f"{setting.name}: depth {config.depth}, width {config.d_model}, {work}"
     size = setting.n_candidates * setting.length * config.d_model

@@ -13,7 +13,7 @@ inpainted present    the planner's present, and the same actor
 guessed present      that of its first guess, and the same actor
 one step             SAID in one denoising step at temperature 0
 SAID                 SAID as its preset decides: in five steps at temperature 0
-from the guess       the same, but the plan starts at the first guess's present
+SAID, inpainting     the same, but the planner fills in the present, too, where SAID has its first guess's
 weighed              SAID whose critics weigh the candidates of two steps at temperature 1
 chosen by Q          the best of these candidates by the mean min Q(s, a) of the steps planned after the decision
 chosen by V          the same by V(s), learned on the replay by implicit Q-learning with two steps for each update
@@ -44,7 +44,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from measure import progress
-from motivation import FROM_GUESS, AllAtOnce, dict_of
+from motivation import INPAINTING, AllAtOnce, dict_of
 from tqdm import tqdm
 
 from sb3_said import SAID, DelayedObservationWrapper, PlannerConfig
@@ -63,7 +63,7 @@ EXPERT = ("expert, last", "expert, average")
 NETWORKS = ("cloning", "regressed present", "inpainted present", "guessed present")
 SETTINGS: dict[str, dict[str, Any]] = {
     "SAID": {},
-    FROM_GUESS: {"present": "guessed"},
+    INPAINTING: {"present": "inpainted"},
     "one step": WAYS["one_step"],
     "weighed": WAYS["weighed"],
     "chosen by Q": {"temperature": 1.0, "sampling_steps": 2, "scored_states": "future"},
@@ -265,11 +265,13 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     args = p.parse_args(argv)
     th.set_num_threads(args.num_threads)
     model = open_run(args.run) if args.log is None else open_with_log(args.run, args.log)
-    if preset_of(model, args).first_guess == "none" and {"guessed present", FROM_GUESS} & {*args.rows}:
-        p.error(f"This planner has no first guess: leave 'guessed present' and {FROM_GUESS!r} out of --rows.")
+    if preset_of(model, args).first_guess == "none" and "guessed present" in args.rows:
+        p.error("This planner has no first guess: leave 'guessed present' out of --rows.")
+    if preset_of(model, args).mask == "none" and {"inpainted present", INPAINTING} & {*args.rows}:
+        p.error(f"This planner inpaints no present: leave 'inpainted present' and {INPAINTING!r} out of --rows.")
     settings: dict[str, Any] = {key: getattr(args, key) for key in ("updates", "episodes", "eval_seed")}
     settings["steps"] = model.num_timesteps
-    settings |= {f"planner_{name}": value for name, value in preset_of(model, args).weight_settings().items()}
+    settings |= {f"planner_{name}": value for name, value in preset_of(model, args).to_dict().items()}
     document = json.loads(args.json.read_text()) if args.json.exists() else {**settings, "returns": {}}
     if given := {key: document.get(key) for key in settings if document.get(key) != settings[key]}:
         asked = {key: settings[key] for key in given}

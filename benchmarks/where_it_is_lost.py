@@ -4,7 +4,7 @@
 
 RUN is a SAID agent that learned from the dataset, at delays up to the largest of --delays.
 
-SAID                     as it is: presents and decisions are decoded together
+SAID                     as it is: if its present is inpainted, present and decision are decoded together
 decoded present, age 0   the planner again, asked without delay on the present that it decoded
 true present, age 0      the same on the true present: what is left is not lost to the delay
 true states since        all states up to the present are told (needs a planner with extra_state_probability)

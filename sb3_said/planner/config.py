@@ -18,7 +18,7 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "prediction": PREDICTIONS,
     "schedule": SCHEDULES,
     "time_sampling": TIME_SAMPLINGS,
-    "mask": ("random", "fixed"),
+    "mask": ("random", "fixed", "none"),
     "action_transform": ("standard", "tanh"),
     "scored_states": ("future", "decision", "all"),
     "present": ("inpainted", "guessed"),
@@ -45,13 +45,12 @@ class PlannerConfig:
     d_model: int = 128  # as accurate as the paper's 256 in the same time on two cores; a multiple of 32
     horizon: int = 8  # paper; a window is max_delay + horizon steps, >= 2 so that a state follows the decision
     embed_known: bool = True  # measured: buys as much accuracy as doubling the depth
-    # Show the network what plain networks make of what is known: the states since by a model of one step, and a clone's
-    # action. Measured on logs: twice the return at delays 4 to 16 (results/offline.md). "residual": the model has two
-    # residual blocks of 256, which know the next state a quarter better in the same time than the two layers of 512 of
-    # "plain" do (results/nine_logs.md). "prior": and the network predicts only what this guess does not; measured on
-    # two logs, and not yet on replay of an expert, so it is no default. "none" is the paper's. Files saved before there
-    # was a choice have True and False, for "plain" and "none"
-    first_guess: str = "residual"
+    # What plain networks make of what is known: the states since by a model of one step, and a clone's action. "prior":
+    # the network predicts what this guess does not, so that a planner begins as good as it (measured on logs and on an
+    # expert's replay, results/nine_logs.md and results/what_diffusion_buys.md). "residual": the guess is shown to the
+    # network, and no more. "plain": the same with a weaker model. "none" is the paper's. Files saved before there was a
+    # choice have True and False, for "plain" and "none"
+    first_guess: str = "prior"
     # Diffusion
     prediction: str = "v"  # measured: safe with few steps; or "epsilon" (paper)
     schedule: str = "cosine"  # measured; or "linear" (DV)
@@ -63,7 +62,10 @@ class PlannerConfig:
     # has one start for a thousand steps, and a planner that falls there never gets to the rest: without, two of three
     # planners of one replay did (measured, results/what_diffusion_buys.md). 0 is the paper's; in [0, 1]
     early_probability: float = 0.25
-    mask: str = "random"  # one network for every delay; or "fixed" at max_delay (paper)
+    # Which actions a training window shows: those of a delay drawn from 0..max_delay, so that one network serves all;
+    # "fixed": those of max_delay (paper); "none": no action, so that every window begins at the present and has horizon
+    # steps, and the first guess goes there from an old observation
+    mask: str = "random"
     mask_end_probability: float = 0.5  # a guess: the longest mask is the hardest; in [0, 1]
     # Part of the training windows that show more states than the first, any subset of those up to the decision index:
     # 0 is the paper's; above it, late observations can be given to plan(), and 0.5 is a guess; in [0, 1]
@@ -86,9 +88,10 @@ class PlannerConfig:
     # results/settings.md)
     choice_factor: float | None = None
     # "inpainted" (paper): the present and the plan are one sample; "guessed": the present is the first guess's, and the
-    # planner plans from there as if it had seen it. Measured on a log of HalfCheetah-v5: twice the return at delays 4
-    # to 16, as a decision from an old observation is nearer to the mean of what may be right (results/nine_logs.md)
-    present: str = "inpainted"
+    # planner plans from there as if it had seen it: at least level on logs and on an expert's replay, and worth twice
+    # as much on some (measured, results/nine_logs.md), as a decision from an old observation is nearer to the mean of
+    # what may be right. None: "guessed" where there is a guess and ``mask`` knows age 0
+    present: str | None = None
     # Training
     learning_rate: float = 2e-3  # measured at depth 2, together with the warm-up
     lr_schedule: str = "cosine"  # paper: down to 0; or "constant"
@@ -109,13 +112,10 @@ class PlannerConfig:
     def __post_init__(self) -> None:
         if isinstance(self.first_guess, bool):
             object.__setattr__(self, "first_guess", "plain" if self.first_guess else "none")
+            object.__setattr__(self, "present", self.present or "inpainted")
         for field in fields(self):
             _check_setting(field.name, getattr(self, field.name), field.default)
-        if self.present == "guessed" and (self.first_guess == "none" or self.mask == "fixed"):
-            raise ValueError(
-                f"present is 'guessed' with first_guess={self.first_guess!r} and mask={self.mask!r}; expected a "
-                "first_guess and mask='random', by which the planner knows age 0."
-            )
+        self._settle_present()
         object.__setattr__(self, "betas", tuple(self.betas))  # JSON gives a list back
         at_least = {"depth": 1, "horizon": 2, "sampling_steps": 1, "n_candidates": 1, "batch_size": 1}
         at_least |= {"temperature": 0, "warmup_steps": 0, "weight_decay": 0, "weight_factor": 0, "decision_weight": 0}
@@ -140,6 +140,22 @@ class PlannerConfig:
         ):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected a number in [0, 1].")
+
+    def _settle_present(self) -> None:
+        """:raises ValueError: for a guessed present where nothing guesses, and any other where none is inpainted"""
+        can_guess = self.first_guess != "none" and self.mask != "fixed"
+        if self.present is None:
+            object.__setattr__(self, "present", "guessed" if can_guess else "inpainted")
+        if self.present == "guessed" and not can_guess:
+            raise ValueError(
+                f"present is 'guessed' with first_guess={self.first_guess!r} and mask={self.mask!r}; expected a "
+                "first_guess and another mask than 'fixed', by which the planner knows age 0."
+            )
+        if self.mask == "none" and self.present != "guessed":
+            raise ValueError(
+                f"mask is 'none' with first_guess={self.first_guess!r} and present={self.present!r}; expected a "
+                "first_guess and present='guessed', as such a planner knows age 0 only."
+            )
 
     def to_dict(self) -> dict[str, Any]:
         """Return every setting in JSON types, as it comes back from a file."""
@@ -195,8 +211,8 @@ def _check_setting(name: str, value: Any, default: Any) -> None:
     elif isinstance(default, tuple):
         fits = isinstance(value, (tuple, list)) and len(value) == 2 and all(_is_number(x) and 0 <= x < 1 for x in value)
         expected = "two numbers in [0, 1)"
-    elif isinstance(default, str):
-        fits, expected = value in CHOICES[name], f"one of {CHOICES[name]}"
+    elif name in CHOICES:
+        fits, expected = value in CHOICES[name] or (value is None and default is None), f"one of {CHOICES[name]}"
     else:
         may_lack = name in ("choice_factor", "gradient_clip")
         fits, expected = _is_number(value) or (may_lack and value is None), "a finite number"

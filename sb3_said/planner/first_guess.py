@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch as th
@@ -83,7 +84,8 @@ def fit_first_guess(
     n_updates: int,
     generator: th.Generator,
     progress_bar: bool = False,
-) -> None:
+    should_stop: Callable[[], bool] | None = None,
+) -> bool:
     """Train the plain networks with Adam, whose rate falls to 0 by a cosine.
 
     :param guess: to train, on the device of the source
@@ -92,6 +94,8 @@ def fit_first_guess(
     :param config: of the planner: how windows are drawn and weighed
     :param generator: of the batches
     :param progress_bar: show one
+    :param should_stop: asked after every update
+    :return: whether all updates were made
     """
     guess.model.move_std.copy_(normalizer.move_std[0])
     groups: list[dict[str, Any]] = [
@@ -109,3 +113,6 @@ def fit_first_guess(
         loss.backward()
         optimizer.step()
         scheduler.step()
+        if should_stop is not None and should_stop():
+            return False
+    return True

@@ -144,10 +144,10 @@ class InpaintingPlanner(nn.Module):
         """Return the weighted mean squared error over unknown entries of valid steps (paper, Appendix B.4).
 
         The decision index counts ``config.decision_weight`` times as much as the others. A window of delay d has
-        d + ``config.horizon`` steps; the rest is ignored.
+        d + ``config.horizon`` steps; the rest is ignored, and with ``mask="none"`` not computed.
 
         :param windows: B windows of ``window_length`` steps, environment units
-        :param delay: (B,) mask lengths; drawn as ``config.mask`` says by default
+        :param delay: (B,) mask lengths; drawn as ``config.mask`` says by default, and zeros with ``mask="none"``
         :param weight: (B,) factor of each window's error; 1 by default
         :param generator: of mask lengths, known states, noise and times; torch's global one by default
         :return: float32 scalar
@@ -157,13 +157,16 @@ class InpaintingPlanner(nn.Module):
         states = float_tensor("windows.states", windows.states, (None, length, self.obs_dim), device)
         n = len(states)
         actions = float_tensor("windows.actions", windows.actions, (n, length, self.act_dim), device)
+        if config.mask == "none":
+            length = config.horizon
+            states, actions = states[:, :length], actions[:, :length]
         if weight is not None:
             weight = float_tensor("weight", weight, (n,), device)
         if delay is None:
             delay = inpainting.draw_delays(n, self.max_delay, config.mask, config.mask_end_probability, generator)
         # Delays on a GPU are not read back: every update would wait for it, and a recorded one could not
         delay = checked_delay(delay, n, self.max_delay).to(device) if delay.device.type == "cpu" else delay
-        valid = windows.valid.to(device) & self._within(delay, length)  # (B, L)
+        valid = windows.valid[:, :length].to(device) & self._within(delay, length)  # (B, L)
         clean = self.normalizer.normalize(states, actions)  # (B, L, obs_dim + act_dim)
         # Steps that are not valid are neither shown nor learned: those behind an episode's end repeat its last row,
         # and a decision at a small delay does without those behind its horizon
@@ -439,7 +442,7 @@ class InpaintingPlanner(nn.Module):
 
         :raises ValueError: for a younger observation amid an episode, which that mask was not trained for
         """
-        if self.config.mask == "random":
+        if self.config.mask != "fixed":
             return delay
         older = th.arange(self.max_delay, device=delay.device) < self.max_delay - delay[:, None]  # (B, D)
         amid = (action_history.ne(0).any(-1) & older).any(1)  # (B,): acted on longer ago than the observation is old

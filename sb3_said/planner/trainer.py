@@ -175,22 +175,26 @@ class PlannerTrainer:
         if self.n_updates % 100 == 0:
             self._check_finite()
 
-    def make_first_guess(self, progress_bar: bool = False) -> None:
-        """Train what the planner is shown a first guess by, which stays as it is from then on; the first update does.
+    def make_first_guess(self, progress_bar: bool = False, should_stop: Callable[[], bool] | None = None) -> bool:
+        """Train what makes the planner's first guess, which stays as it is from then on; the first update does.
 
         :param progress_bar: show one
+        :param should_stop: asked after every update; where it says so, this trainer is of no use any more
+        :return: whether there is one, or none is asked for; False where ``should_stop`` has ended it
         """
         guess, is_made = self.online.first_guess, self.n_updates > 0 or self._has_guessed
         if is_made or guess is None or self.average.first_guess is None:
-            return
+            return True
         n_updates = min(GUESS_UPDATES, GUESS_UPDATES_EACH * self.gradient_steps)
-        drawn = self.average.normalizer, self.config, n_updates, self.generator, progress_bar
-        fit_first_guess(guess, self.source, *drawn)
+        drawn = self.average.normalizer, self.config, n_updates, self.generator
+        if not fit_first_guess(guess, self.source, *drawn, progress_bar, should_stop):
+            return False
         guess.requires_grad_(False)
         if self.online.prior is not None:
             self.online.fit_prior(self.source.sample(N_PRIOR_WINDOWS, self.online.window_length, self.generator))
         self.average.load_state_dict(self.online.state_dict())
         self._has_guessed = True
+        return True
 
     def _descend(self) -> tuple[th.Tensor]:
         """Draw a batch, move both sets of weights, and return both losses, (2,), without waiting for the device."""
@@ -199,8 +203,7 @@ class PlannerTrainer:
             optimizer.zero_grad()
         drawn = config.batch_size, self.average.window_length, self.generator, config.early_probability
         windows = self.source.sample(*drawn)
-        mask = config.mask, config.mask_end_probability
-        delay = draw_delays(config.batch_size, self.average.max_delay, *mask, self.generator).to(self.device)  # (B,)
+        delay = self._draw_delays(config.mask)  # (B,)
         weight = window_weight(windows.values, config.weight_factor)  # (B,)
         loss = self.online.loss(windows, delay, weight, self.generator)
         loss.backward()
@@ -208,11 +211,17 @@ class PlannerTrainer:
             th.nn.utils.clip_grad_norm_(self._online, config.gradient_clip)
         self.optimizer.step()
 
+        if config.mask == "none":  # the regression has no guess, and meets every age itself
+            delay = self._draw_delays("random")
         windows = windows._replace(states=self.average.normalizer.normalize_states(windows.states))
         yardstick_loss = self.yardstick.loss(windows, delay, weight)
         yardstick_loss.backward()
         self.yardstick_optimizer.step()
         return (th.stack((loss, yardstick_loss)).detach(),)
+
+    def _draw_delays(self, mask: str) -> th.Tensor:
+        drawn = self.config.batch_size, self.average.max_delay, mask, self.config.mask_end_probability, self.generator
+        return draw_delays(*drawn).to(self.device)
 
     def train(
         self, n_steps: int | None = None, callback: Callable[[PlannerTrainer], bool | None] | None = None

@@ -410,7 +410,8 @@ class SAID(OfflineAlgorithm, StableSAC):
         intervals = log_interval, eval_interval, save_interval
         training = PlannerTraining(self, trainer, values, lambda n_updates: n_updates, folder, *intervals, watcher)
         self.num_timesteps = trainer.n_updates
-        trainer.make_first_guess(progress_bar)
+        if not trainer.make_first_guess(progress_bar, should_stop):
+            raise KeyboardInterrupt
         watcher.on_training_start(locals() | {"total_timesteps": total, "callback": watcher}, globals())
 
         def on_step(n_updates: int) -> bool:

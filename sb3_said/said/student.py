@@ -205,7 +205,7 @@ def _replayed(model: SAID, config: Distillation, generator: th.Generator) -> _Ro
     source = model.replay_buffer.window_source(model.planner_newest_fraction, model.get_vec_normalize_env())
     windows = source.sample(n, max_delay + 1, generator, planner.config.early_probability)
     ages = th.full((n,), max_delay)
-    if planner.config.mask == "random":
+    if planner.config.mask != "fixed":
         ages = th.randint(max_delay + 1, (n,), generator=generator)
     ages = th.minimum(ages, windows.valid.sum(1) - 1)  # (B,): s_t is in the window
     steps = th.arange(max_delay) - (max_delay - ages)[:, None]  # (B, D): index of each action in the window

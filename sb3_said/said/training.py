@@ -74,7 +74,8 @@ class PlannerTraining:
     ) -> Literal["done", "interrupted", "stopped"]:
         """Make all updates that are left, and hand over. Ctrl-C ends the training early and keeps what was learned.
 
-        :param should_stop: asked after every update; where it says so, a checkpoint is written and the training ends
+        :param should_stop: asked after every update; where it says so, a checkpoint is written and the training ends;
+            none of the first guess, which takes minutes
         :param on_step: called with the number of updates made after each; the training ends when it returns False
         :return: ``"interrupted"`` after Ctrl-C, ``"stopped"`` by ``should_stop``
         """
@@ -97,9 +98,11 @@ class PlannerTraining:
             return outcome == "done" and goes_on
 
         try:
-            trainer.make_first_guess(progress_bar)
-            with tqdm(total=total, initial=trainer.n_updates, desc="planner", disable=not progress_bar) as bar:
-                trainer.train(callback=on_update)
+            if trainer.make_first_guess(progress_bar, should_stop):
+                with tqdm(total=total, initial=trainer.n_updates, desc="planner", disable=not progress_bar) as bar:
+                    trainer.train(callback=on_update)
+            else:
+                outcome = "stopped"
         except KeyboardInterrupt:
             outcome = "interrupted"
         if outcome == "interrupted":

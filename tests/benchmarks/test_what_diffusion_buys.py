@@ -89,7 +89,7 @@ def test_together_planners_answer_their_mean(run):
     for seed in (1, 2):
         script.train(model, model.policy.planner.config, 2, seed)
         planners.append(copy.deepcopy(model.policy.planner))
-    observation = {"observation": np.ones((3, 4), np.float32), "action_history": np.zeros((3, 2, 1), np.float32)}
+    observation = {"observation": np.full((3, 4), 0.01, np.float32), "action_history": np.zeros((3, 2, 1), np.float32)}
     observation["delay"] = np.array([[0.0], [1.0], [2.0]], np.float32)
     with model.policy.answering("planner"):
         answer, _ = script.Together(model, planners).predict(observation)

@@ -28,7 +28,15 @@ def test_settings_of_sampling_do_not_decide_the_weights():
 
 
 def test_files_from_before_there_was_a_choice_of_the_first_guess_are_read():
-    assert [PlannerConfig(first_guess=saved).first_guess for saved in (True, False)] == ["plain", "none"]
+    read = [PlannerConfig(first_guess=saved) for saved in (True, False)]
+    assert [config.first_guess for config in read] == ["plain", "none"]
+    assert [config.present for config in read] == ["inpainted"] * 2  # which was all there was
+
+
+def test_a_plan_begins_at_the_guessed_present_where_there_is_one():
+    assert PlannerConfig().present == PlannerConfig(mask="none").present == "guessed"
+    assert PlannerConfig(first_guess="none").present == PlannerConfig(mask="fixed").present == "inpainted"
+    assert PlannerConfig(present="inpainted").present == "inpainted"
 
 
 def test_config_survives_json():
@@ -43,6 +51,9 @@ def test_config_survives_json():
         ({"schedule": "sqrt"}, "schedule is 'sqrt'"),
         ({"time_sampling": "beta"}, "time_sampling is 'beta'"),
         ({"mask": "block"}, "mask is 'block'"),
+        ({"mask": "none", "first_guess": "none"}, "mask is 'none' with first_guess='none' and present='inpainted'"),
+        ({"mask": "none", "present": "inpainted"}, "mask is 'none' .* present='inpainted'; expected a first_guess"),
+        ({"present": "seen"}, "present is 'seen', expected one of"),
         ({"action_transform": "log"}, "action_transform is 'log'"),
         ({"scored_states": "past"}, "scored_states is 'past'"),
         ({"value_scale": "log"}, "value_scale is 'log'"),

@@ -112,7 +112,7 @@ def test_a_training_with_it_resumes_bit_for_bit():
     second.train()
     for name, weight in second.planner.state_dict().items():
         assert th.equal(weight, whole.planner.state_dict()[name]), name
-    with pytest.raises(ValueError, match="first_guess was residual and is now none"):
+    with pytest.raises(ValueError, match="first_guess was prior and is now none"):
         make_trainer(first_guess="none").load_state_dict(first.state_dict())
 
 
@@ -124,6 +124,14 @@ def test_it_is_made_once_and_then_stays():
     for planner in (trainer.planner, trainer.online):
         for name, weight in planner.first_guess.state_dict().items():
             assert th.equal(weight, made[name]), name
+
+
+def test_it_can_be_stopped():
+    trainer, asked = make_trainer(), []
+    assert not trainer.make_first_guess(should_stop=lambda: asked.append(0) or len(asked) == 3)
+    assert len(asked) == 3 and trainer.n_updates == 0
+    assert make_trainer().make_first_guess(should_stop=lambda: False)
+    assert make_trainer(first_guess="none").make_first_guess(should_stop=lambda: True)  # there is nothing to make
 
 
 def test_decisions_of_mixed_ages_are_those_one_by_one():
@@ -185,6 +193,21 @@ def test_a_plan_from_the_guessed_present_is_another_one_and_its_candidates_are_c
     guessing.config = replace(guessing.config, present="inpainted")
     assert not th.allclose(guessing.plan(observation, history, delay, **asked).action, by_action.action, atol=1e-3)
     guessing.config = replace(guessing.config, present="guessed")
+
+
+def test_a_planner_of_windows_that_begin_at_the_present_decides_at_every_age():
+    trainer = make_trainer(precision="float32", mask="none")
+    trainer.train()
+    planner = trainer.planner
+    planner.check_ages([0, D])
+    observation, history = th.ones(D + 1, STATE_DIM), th.zeros(D + 1, D, ACTION_DIM)
+    plan = planner.plan(observation, history, th.arange(D + 1))
+    assert th.equal(plan.present[0], observation[0])
+    for d in range(1, D + 1):
+        alone = planner.plan(plan.present[d : d + 1], history[:1], th.tensor([0]))
+        th.testing.assert_close(alone.action[0], plan.action[d], atol=1e-5, rtol=1e-5)
+    errors = trainer.evaluate()
+    assert {f"planner/present_error{who}_d{d}" for who in ("", "_mlp") for d in range(D + 1)} < set(errors)
 
 
 def test_without_a_guess_no_present_can_be_guessed():

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch as th
+import torch.nn.functional as F
 from hypothesis import given
 from hypothesis import strategies as st
 from small_planner import (
@@ -162,6 +163,19 @@ def test_a_small_decision_is_made_in_float32_at_every_age(monkeypatch):
             ages = th.full((n,), delay)
             plans = [p.plan(*batch[:2], ages, temperature=0.0).action for p in (planner, reference)]
             assert th.equal(*plans) == is_small
+
+
+def test_windows_that_begin_at_the_present_are_learned_as_those_of_age_0():
+    planners = [make_planner(mask=mask, present="guessed") for mask in ("random", "none")]
+    windows = make_windows()
+    delays = th.zeros(len(windows.states), dtype=th.int64)
+    noise = th.randn(len(windows.states), SMALL.horizon, OBS + ACT, generator=seeded(2))
+    for planner in planners:  # noise is drawn for as many steps as are computed
+        planner._noise = lambda shape, _: F.pad(noise, (0, 0, 0, shape[1] - noise.shape[1]))
+    losses = [planner.loss(windows, delays, generator=seeded()) for planner in planners]
+    th.testing.assert_close(*losses, atol=1e-6, rtol=1e-5)
+    drawn = planners[1].loss(windows, generator=seeded())
+    th.testing.assert_close(drawn, losses[1], atol=1e-6, rtol=1e-5)
 
 
 # --- plan ------------------------------------------------------------------------------------------------------------

@@ -53,7 +53,7 @@ def trainer() -> PlannerTrainer:
     with th.random.fork_rng(devices=[]):
         th.manual_seed(0)
         small = PlannerConfig(
-            first_guess="prior", depth=1, d_model=32, horizon=HORIZON, precision="float32", weight_factor=0.0
+            depth=1, d_model=32, horizon=HORIZON, present="inpainted", precision="float32", weight_factor=0.0
         )
         trainer = PlannerTrainer(InpaintingPlanner(STATE_DIM, ACTION_DIM, D, small), make_source(), gradient_steps=100)
     trainer.make_first_guess()

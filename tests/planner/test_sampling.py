@@ -25,6 +25,7 @@ CONFIG = PlannerConfig(
     precision="float32",
     scored_states="future",
     first_guess="prior",
+    present="inpainted",
 )
 LENGTH = DELAY + CONFIG.horizon
 

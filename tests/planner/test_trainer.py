@@ -162,7 +162,7 @@ def planned():
 
 @pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(PlannerConfig)])
 def test_every_setting_matters(name, planned):
-    needs = {"first_guess": OTHER_SETTINGS["first_guess"]} if name == "present" else {}
+    needs = {"first_guess": OTHER_SETTINGS["first_guess"], "present": "inpainted"} if name == "present" else {}
     usual = train_and_plan(**needs) if needs else planned
     assert not np.array_equal(usual, train_and_plan(**{**needs, name: OTHER_SETTINGS[name]}))
 

@@ -16,7 +16,7 @@ from sb3_said.files import checkpoint
 from sb3_said.files.archive import SavedFileError, load_tree, save_tree
 from sb3_said.files.checkpoint import TrainingCheckpointCallback, restore_training
 from sb3_said.planner import InpaintingPlanner
-from sb3_said.planner.trainer import PlannerTrainer
+from sb3_said.planner.trainer import GUESS_UPDATES_EACH, PlannerTrainer
 from sb3_said.said import training
 from sb3_said.said.training import PLANNER_CHECKPOINT_NAME
 
@@ -378,7 +378,7 @@ def test_a_stop_amid_one_of_several_trainings_loses_no_update(tmp_path, training
 
     def should_stop():
         asked.append(True)
-        return len(asked) == 4
+        return len(asked) == 6 * GUESS_UPDATES_EACH + 4  # of six updates the fourth, after those of the guess
 
     checkpointing = TrainingCheckpointCallback(tmp_path, 1000)
     with pytest.raises(KeyboardInterrupt):

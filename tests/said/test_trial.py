@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_said import SAID, DelayedObservationWrapper
 from sb3_said.delays import UniformDelay
+from sb3_said.planner.trainer import GUESS_UPDATES_EACH
 from sb3_said.said import trial
 
 
@@ -113,15 +114,15 @@ def test_ages_that_change_within_an_episode_tell_nothing_of_it():
 
 def test_a_trial_can_be_stopped_and_the_planner_stays_trained():
     model, asked = make(env=pendulum(), planner_ways={}).learn(60), []
-    own = model.policy.planner.config
+    own, n_updates = model.policy.planner.config, 5 * GUESS_UPDATES_EACH + 5
 
     def should_stop():
         asked.append(model.policy.who_answers)
-        return len(asked) > 5 + 20  # after the five updates, amid the trial's second episode
+        return len(asked) > n_updates + 20  # amid the trial's second episode
 
     with pytest.raises(KeyboardInterrupt):
         model.train_planner(5, trial_episodes=9, should_stop=should_stop)
-    assert len(asked) == 26 and asked[-1] == "planner" == model.policy.who_answers
+    assert len(asked) == n_updates + 21 and asked[-1] == "planner" == model.policy.who_answers
     assert model.policy.planner.config == own
 
 

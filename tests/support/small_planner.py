@@ -17,6 +17,8 @@ SMALL = PlannerConfig(
     n_candidates=5,
     temperature=0.5,
     scored_states="future",
+    first_guess="residual",
+    present="inpainted",
 )
 LENGTH = DELAY + SMALL.horizon
 

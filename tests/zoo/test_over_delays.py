@@ -235,7 +235,7 @@ def test_only_the_warning_of_another_delay_is_silent(sadr: Path) -> None:
 def test_a_planner_of_one_delay_plays_no_other(said: Path) -> None:
     model: Any = load_run(said, device="cpu").model
     planner = model.policy.planner
-    planner.config = replace(planner.config, mask="fixed")
+    planner.config = replace(planner.config, mask="fixed", present="inpainted")
     found = {delay: over_delays.obstacle(model, "planner", delay) for delay in (1, 2, "UniformDelay(0, 2)")}
     assert found.pop(2) is None
     assert all(reason.startswith("A planner with mask='fixed' plans at age 2 only") for reason in found.values())
