@@ -13,7 +13,8 @@ error   root mean squared error of s_t on held-out episodes, in standard deviati
 return  of one actor without delay that acts on each belief, over seeded episodes: behaviour cloning of the same
         episodes at delay 0, or --actor. Beside it "old observation", on which it acts as if nothing was delayed,
         "SAID", whose planner decides itself, "one step", the same with one step of denoising, "SAID, inpainting", the
-        same as SAID with its present inpainted, and "cloning": BC on the augmented state
+        same as SAID with its present inpainted, "guess alone", the clone of SAID's first guess at the present that it
+        guesses, and "cloning": BC on the augmented state
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ import torch as th
 from tqdm import tqdm
 
 from sb3_said import SAID, DelayedObservationWrapper, PlannerConfig
+from sb3_said.delays.space import KEYS
 from sb3_said.evaluation import Summary, plots, rollout
 from sb3_said.files.atomic import write_json
 from sb3_said.offline import BC, Dataset, load_dataset, normalized_score, reference_returns
@@ -48,8 +50,8 @@ from sb3_said.zoo.runs import LoadedRun, load_run, origin
 
 N_WINDOWS = 5_000  # held out, at most
 PLAIN: dict[str, type[LearnedBelief]] = {"rolled out": RolledOutModel, "regressed": RegressedPresent}
-INPAINTING = "SAID, inpainting"
-PLAYERS = ["inpainted", "guessed", *PLAIN, "old observation", "SAID", "one step", INPAINTING, "cloning"]
+INPAINTING, GUESS_ALONE = "SAID, inpainting", "guess alone"
+PLAYERS = ["inpainted", "guessed", *PLAIN, "old observation", "SAID", "one step", INPAINTING, GUESS_ALONE, "cloning"]
 
 
 def load_agent(path: str | Path, device: str = "cpu") -> LoadedRun:
@@ -86,6 +88,19 @@ class AllAtOnce:
     def predict(self, observation: Any, *_: Any, **__: Any) -> tuple[np.ndarray, Any]:
         self.said.set_planner(**self.settings)
         return self.said.predict(observation, deterministic=False)
+
+
+class GuessAlone:
+    """Decides as the first guess of SAID's planner does by itself."""
+
+    def __init__(self, said: SAID):
+        self.said = said
+
+    def predict(self, observation: Any, state: Any = None, **_: Any) -> tuple[np.ndarray, Any]:
+        parts = {key: th.as_tensor(observation[key], device=self.said.device) for key in KEYS}
+        planner = self.said.policy.planner
+        action = planner.guess(parts[KEYS[0]], parts[KEYS[1]], parts[KEYS[2]][:, 0].long())[1]
+        return self.said.policy.unscale_action(action.cpu().numpy()), state
 
 
 def split(data: Dataset, held_out: float, seed: int) -> tuple[Dataset, Dataset]:
@@ -214,8 +229,10 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     config = PlannerConfig(**args.planner_kwargs)
     if config.mask == "none":
         p.error("A planner with mask=none inpaints no present, which is what is compared here; give another mask.")
-    if config.first_guess == "none" and "guessed" in args.players:
-        p.error("A planner without a first guess guesses no present: leave 'guessed' out of --players.")
+    if config.first_guess == "none" and {"guessed", GUESS_ALONE} & {*args.players}:
+        p.error(
+            f"A planner without a first guess guesses nothing: leave 'guessed' and {GUESS_ALONE!r} out of --players."
+        )
     args.max_delay = max(args.delays)
     args.plain_steps = args.plain_steps or args.gradient_steps
     th.set_num_threads(args.num_threads)
@@ -234,6 +251,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     players["SAID"] = AllAtOnce(said, sampling_steps=own.sampling_steps, present=own.present)
     players["one step"] = AllAtOnce(said, sampling_steps=1, present=own.present)
     players[INPAINTING] = AllAtOnce(said, sampling_steps=own.sampling_steps, present="inpainted")
+    players[GUESS_ALONE] = GuessAlone(said)
     players["cloning"] = cloning
     table = returns({name: players[name] for name in args.players}, args)
     show({k: [str(s.mean_return) for s in row] for k, row in table.items()}, "return at delay", args.delays)

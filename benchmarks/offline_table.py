@@ -30,6 +30,7 @@ NAMES = {
     "SAID": "SAID",
     "one step": "SAID, one step",
     "SAID, inpainting": "SAID, inpainting",
+    "guess alone": "its first guess alone",
     "inpainted": "belief-only",
     "guessed": "belief-only, guessed present",
     "cloning": "BC",

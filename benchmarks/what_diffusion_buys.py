@@ -11,6 +11,7 @@ cloning              a plain network from what is known under delay to the actio
 regressed present    such a network for the present, and the expert's actor for age 0 on it
 inpainted present    the planner's present, and the same actor
 guessed present      that of its first guess, and the same actor
+guess alone          the clone of the first guess, at the present that it guesses
 one step             SAID in one denoising step at temperature 0
 SAID                 SAID as its preset decides: in five steps at temperature 0
 SAID, inpainting     the same, but the planner fills in the present, too, where SAID has its first guess's
@@ -44,7 +45,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from measure import progress
-from motivation import INPAINTING, AllAtOnce, dict_of
+from motivation import GUESS_ALONE, INPAINTING, AllAtOnce, GuessAlone, dict_of
 from tqdm import tqdm
 
 from sb3_said import SAID, DelayedObservationWrapper, PlannerConfig
@@ -60,7 +61,7 @@ from sb3_said.said.trial import WAYS
 from sb3_said.zoo.runs import load_run
 
 EXPERT = ("expert, last", "expert, average")
-NETWORKS = ("cloning", "regressed present", "inpainted present", "guessed present")
+NETWORKS = ("cloning", "regressed present", "inpainted present", "guessed present", GUESS_ALONE)
 SETTINGS: dict[str, dict[str, Any]] = {
     "SAID": {},
     INPAINTING: {"present": "inpainted"},
@@ -215,9 +216,12 @@ def players(model: SAID, rows: list[str], args: argparse.Namespace) -> Iterator[
             with policy.answering("expert"):
                 yield "cloning", seed, regression
                 yield "regressed present", seed, BeliefOnly(regression, model)
-                yield "inpainted present", seed, BeliefOnly(PlannerBelief(policy.planner), model)
-                if f"guessed present/{seed}" in rows:
-                    yield "guessed present", seed, BeliefOnly(PlannerBelief(policy.planner, "guessed"), model)
+                yield from (
+                    (f"{which} present", seed, BeliefOnly(PlannerBelief(policy.planner, which), model))
+                    for which in ("inpainted", "guessed")
+                    if f"{which} present/{seed}" in rows  # not every planner has both
+                )
+                yield GUESS_ALONE, seed, GuessAlone(model)
             for row, how in SETTINGS.items():
                 if f"{row}/{seed}" not in rows:
                     continue
@@ -265,8 +269,8 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     args = p.parse_args(argv)
     th.set_num_threads(args.num_threads)
     model = open_run(args.run) if args.log is None else open_with_log(args.run, args.log)
-    if preset_of(model, args).first_guess == "none" and "guessed present" in args.rows:
-        p.error("This planner has no first guess: leave 'guessed present' out of --rows.")
+    if preset_of(model, args).first_guess == "none" and {"guessed present", GUESS_ALONE} & {*args.rows}:
+        p.error(f"This planner has no first guess: leave 'guessed present' and {GUESS_ALONE!r} out of --rows.")
     if preset_of(model, args).mask == "none" and {"inpainted present", INPAINTING} & {*args.rows}:
         p.error(f"This planner inpaints no present: leave 'inpainted present' and {INPAINTING!r} out of --rows.")
     settings: dict[str, Any] = {key: getattr(args, key) for key in ("updates", "episodes", "eval_seed")}

@@ -48,7 +48,9 @@ class PlannerBelief:
         self.planner.config = replace(planner.config, present=which)
 
     def present(self, state: th.Tensor, action_history: th.Tensor, delay: th.Tensor) -> th.Tensor:
-        """Return the one present that no initial noise leads to: (B, obs_dim)."""
+        """Return the one present that no initial noise leads to, or that is guessed: (B, obs_dim)."""
+        if self.planner.config.present == "guessed":
+            return self.planner.guess(state, action_history, delay)[0]
         return self.planner.plan(state, action_history, delay, n_candidates=1, temperature=0.0).present
 
 

@@ -286,6 +286,30 @@ class InpaintingPlanner(nn.Module):
             )
         return plan
 
+    @th.no_grad()
+    def guess(self, observation: th.Tensor, action_history: th.Tensor, delay: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Return what the first guess says by itself: the present (B, obs_dim), and an action (B, act_dim) in [-1, 1].
+
+        :param observation: (B, obs_dim); this and the next two as of :meth:`plan`
+        :param action_history: (B, D, act_dim)
+        :param delay: (B,)
+        :raises ValueError: for wrong shapes, numbers that are not finite, delays outside 0..max_delay, or a planner
+            without a first guess
+        """
+        if self.first_guess is None:
+            raise ValueError("This planner has no first guess; build it with another first_guess than 'none'.")
+        observation = finite_tensor("observation", observation, (None, self.obs_dim), self.device)
+        n = len(observation)
+        action_history = finite_tensor("action_history", action_history, (n, self.max_delay, self.act_dim), self.device)
+        delay = checked_delay(delay, n, self.max_delay).to(self.device)
+        given = inpainting.known_window(observation, action_history, delay, self.window_length)
+        states, actions = given.split(self.sizes, dim=-1)
+        known = inpainting.known_mask(delay, self.window_length, self.obs_dim, self.act_dim)
+        guess = self._guess(states, actions, delay, known)
+        assert guess is not None  # for mypy: there is a first guess
+        z, action, _ = guess[th.arange(n, device=self.device), delay].split([*self.sizes, self.obs_dim], dim=-1)
+        return th.where(delay[:, None] == 0, observation, self.normalizer.denormalize_states(z)), action
+
     def _can_be_recorded(self, value_fn: ValueFn | None) -> bool:
         return self.device.type == "cuda" and (value_fn is None or isinstance(_owner(value_fn), nn.Module))
 

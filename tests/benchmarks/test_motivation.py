@@ -62,7 +62,7 @@ def test_it_measures_errors_and_returns_of_each_belief(log, tmp_path, capsys):
     assert written["dataset"] == [str(tmp_path / "log.npz")] and written["env"] == ENV
     assert {"command", "date", "machine", "versions"} < set(written["origin"])
     names = ["inpainted", "guessed", "rolled out", "regressed", "old observation"]
-    players = [*names, "SAID", "one step", "SAID, inpainting", "cloning"]
+    players = [*names, "SAID", "one step", "SAID, inpainting", "guess alone", "cloning"]
     assert list(written["errors"]) == names and list(written["returns"]) == players
     for name, (now, later) in written["errors"].items():
         assert later > 0 and (now < 1e-6 or name == "regressed")  # which is asked at delay 0, too
@@ -75,7 +75,10 @@ def test_it_measures_errors_and_returns_of_each_belief(log, tmp_path, capsys):
         *("--players", "SAID", "inpainted"),
     ])  # fmt: skip
     assert list(some["errors"]) == ["inpainted", "old observation"]
-    for given, message in (("first_guess=none", "leave 'guessed' out"), ("mask=none", "inpaints no present")):
+    for given, message in (
+        ("first_guess=none", "leave 'guessed' and 'guess alone' out"),
+        ("mask=none", "inpaints no present"),
+    ):
         with pytest.raises(SystemExit):
             motivation.main(["--dataset", str(tmp_path / "log.npz"), "--planner-kwargs", given])
         assert message in capsys.readouterr().err

@@ -185,6 +185,24 @@ def test_a_plan_from_the_guessed_present_is_the_plan_of_who_sees_it(guessing: In
 
 
 @th.no_grad()
+def test_a_guess_is_where_a_plan_begins_and_what_the_clone_does_there(guessing: InpaintingPlanner):
+    observation, history = (
+        th.randn(D + 1, STATE_DIM, generator=th.Generator().manual_seed(3)),
+        th.ones(D + 1, D, ACTION_DIM),
+    )
+    present, action = guessing.guess(observation, history, th.arange(D + 1))
+    plan = guessing.plan(observation, history, th.arange(D + 1), temperature=0.0)
+    th.testing.assert_close(present, plan.present)
+    assert th.equal(present[0], observation[0])
+    clone = guessing.first_guess.clone(guessing.normalizer.normalize_states(present)).clamp(-1, 1)
+    th.testing.assert_close(action, clone, atol=1e-5, rtol=1e-5)
+    with pytest.raises(ValueError, match="delay"):
+        guessing.guess(observation, history, th.arange(D + 1) + 1)
+    with pytest.raises(ValueError, match="no first guess"):
+        make_trainer(first_guess="none").planner.guess(observation, history, th.arange(D + 1))
+
+
+@th.no_grad()
 def test_a_plan_from_the_guessed_present_is_another_one_and_its_candidates_are_chosen(guessing: InpaintingPlanner):
     observation, history, delay = th.ones(2, STATE_DIM), th.ones(2, D, ACTION_DIM), th.tensor([D, D])
     asked = dict(noise=th.randn(3, L, STATE_DIM + ACTION_DIM, generator=th.Generator().manual_seed(0)), temperature=1.0)
