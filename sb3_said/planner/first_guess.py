@@ -17,7 +17,7 @@ from sb3_said.replay.windows import WindowSource
 
 CLONE_WIDTH = 256
 CLONE_LEARNING_RATE = 1e-3
-BATCH_SIZE = 256
+GUESS_BATCH_SIZE = 256
 # Standard deviations: a model that is asked far from its data must not run away. A log without noise has falls at 31
 FARTHEST = 100.0
 
@@ -105,7 +105,7 @@ def fit_first_guess(
     optimizer = th.optim.Adam(groups, fused=True)
     scheduler = th.optim.lr_scheduler.CosineAnnealingLR(optimizer, n_updates)
     for _ in tqdm(range(n_updates), desc="first guess", disable=not progress_bar):
-        windows = source.sample(BATCH_SIZE, 2, generator, config.early_probability)
+        windows = source.sample(GUESS_BATCH_SIZE, 2, generator, config.early_probability)
         states = normalizer.normalize_states(windows.states)
         weight = window_weight(windows.values, config.weight_factor)
         loss = guess.loss(states, windows.actions[:, 0], windows.valid[:, 1], weight)

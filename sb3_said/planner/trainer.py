@@ -12,7 +12,7 @@ import torch as th
 import torch.nn.functional as F
 
 from sb3_said.planner.config import PlannerConfig
-from sb3_said.planner.first_guess import fit_first_guess
+from sb3_said.planner.first_guess import GUESS_BATCH_SIZE, fit_first_guess
 from sb3_said.planner.graphs import RecordedFunction
 from sb3_said.planner.inpainting import draw_delays
 from sb3_said.planner.memory import keep_freed_memory
@@ -25,9 +25,9 @@ HELD_OUT_WINDOWS = 1024  # per delay, in evaluate(): tells errors that differ by
 YARDSTICK_LEARNING_RATE = 1e-3
 N_NORMALIZER_WINDOWS = 10_000  # enough for a standard deviation to a percent
 N_PRIOR_WINDOWS = 1_000  # each is guessed at every age
-# Of the plain networks of a first guess, before the planner's: up to a minute and a half on one core, a fifth of the
-# time of 4,000 updates of the planner
-GUESS_UPDATES, GUESS_UPDATES_EACH = 20_000, 5
+# Of the plain networks of a first guess, before the planner's: at most so many, so many for each of the planner's, and
+# so many passes over the data: a clone of few rows knows them by heart otherwise (results/nine_logs/guess_passes.txt)
+GUESS_UPDATES, GUESS_UPDATES_EACH, GUESS_PASSES = 20_000, 5, 50
 
 
 def learning_rate(step: int, gradient_steps: int, config: PlannerConfig) -> float:
@@ -185,7 +185,8 @@ class PlannerTrainer:
         guess, is_made = self.online.first_guess, self.n_updates > 0 or self._has_guessed
         if is_made or guess is None or self.average.first_guess is None:
             return True
-        n_updates = min(GUESS_UPDATES, GUESS_UPDATES_EACH * self.gradient_steps)
+        passes = -(-GUESS_PASSES * len(self.source) // GUESS_BATCH_SIZE)
+        n_updates = min(GUESS_UPDATES, GUESS_UPDATES_EACH * self.gradient_steps, passes)
         drawn = self.average.normalizer, self.config, n_updates, self.generator
         if not fit_first_guess(guess, self.source, *drawn, progress_bar, should_stop):
             return False

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from linear_system import ACTION_DIM, BEHAVIOUR_GAIN, STATE_DIM, make_source, present
 
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
+from sb3_said.planner import trainer as trainer_module
 from sb3_said.planner.first_guess import FARTHEST, FirstGuess, fit_first_guess
 from sb3_said.planner.normalizer import Normalizer
 from sb3_said.planner.trainer import PlannerTrainer
@@ -96,12 +97,12 @@ def test_it_learns_a_linear_system_and_its_behaviour():
     assert (made[:, D, STATE_DIM:] - behaviour).abs().mean() < 0.3 * behaviour.abs().mean()
 
 
-def make_trainer(**changes) -> PlannerTrainer:
+def make_trainer(gradient_steps: int = 12, **changes) -> PlannerTrainer:
     small = dict(depth=1, d_model=32, horizon=HORIZON, batch_size=16, warmup_steps=4)
     with th.random.fork_rng(devices=[]):
         th.manual_seed(0)
         planner = InpaintingPlanner(STATE_DIM, ACTION_DIM, D, PlannerConfig(**{**small, **changes}))
-    return PlannerTrainer(planner, make_source(40, 20), gradient_steps=12)
+    return PlannerTrainer(planner, make_source(40, 20), gradient_steps)
 
 
 def test_a_training_with_it_resumes_bit_for_bit():
@@ -124,6 +125,15 @@ def test_it_is_made_once_and_then_stays():
     for planner in (trainer.planner, trainer.online):
         for name, weight in planner.first_guess.state_dict().items():
             assert th.equal(weight, made[name]), name
+
+
+@pytest.mark.parametrize(("gradient_steps", "most"), [(2, 10**9), (1000, 30), (1000, 10**9)])
+def test_it_takes_no_more_updates_than_planner_and_data_are_worth(gradient_steps: int, most: int, monkeypatch):
+    monkeypatch.setattr(trainer_module, "GUESS_UPDATES", most)
+    trainer, asked = make_trainer(gradient_steps), []
+    trainer.make_first_guess(should_stop=lambda: bool(asked.append(0)))
+    passes = 256 * len(asked) / len(trainer.source)
+    assert len(asked) == 5 * gradient_steps or len(asked) == most or 50 <= passes < 50.5
 
 
 def test_it_can_be_stopped():

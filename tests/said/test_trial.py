@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_said import SAID, DelayedObservationWrapper
 from sb3_said.delays import UniformDelay
+from sb3_said.planner import trainer as trainer_module
 from sb3_said.planner.trainer import GUESS_UPDATES_EACH
 from sb3_said.said import trial
 
@@ -112,7 +113,8 @@ def test_ages_that_change_within_an_episode_tell_nothing_of_it():
     np.testing.assert_array_equal(trial.play_trial(model, n_episodes=4).ages, np.zeros(4))
 
 
-def test_a_trial_can_be_stopped_and_the_planner_stays_trained():
+def test_a_trial_can_be_stopped_and_the_planner_stays_trained(monkeypatch):
+    monkeypatch.setattr(trainer_module, "GUESS_PASSES", 10_000)  # so that few rows do not end the guess sooner
     model, asked = make(env=pendulum(), planner_ways={}).learn(60), []
     own, n_updates = model.policy.planner.config, 5 * GUESS_UPDATES_EACH + 5
 
