@@ -269,13 +269,14 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     args = p.parse_args(argv)
     th.set_num_threads(args.num_threads)
     model = open_run(args.run) if args.log is None else open_with_log(args.run, args.log)
-    if preset_of(model, args).first_guess == "none" and {"guessed present", GUESS_ALONE} & {*args.rows}:
+    preset = preset_of(model, args)
+    if preset.first_guess == "none" and {"guessed present", GUESS_ALONE} & {*args.rows}:
         p.error(f"This planner has no first guess: leave 'guessed present' and {GUESS_ALONE!r} out of --rows.")
-    if preset_of(model, args).mask == "none" and {"inpainted present", INPAINTING} & {*args.rows}:
+    if preset.mask == "none" and {"inpainted present", INPAINTING} & {*args.rows}:
         p.error(f"This planner inpaints no present: leave 'inpainted present' and {INPAINTING!r} out of --rows.")
     settings: dict[str, Any] = {key: getattr(args, key) for key in ("updates", "episodes", "eval_seed")}
     settings["steps"] = model.num_timesteps
-    settings |= {f"planner_{name}": value for name, value in preset_of(model, args).to_dict().items()}
+    settings |= {f"planner_{name}": value for name, value in preset.to_dict().items()}
     document = json.loads(args.json.read_text()) if args.json.exists() else {**settings, "returns": {}}
     if given := {key: document.get(key) for key in settings if document.get(key) != settings[key]}:
         asked = {key: settings[key] for key in given}

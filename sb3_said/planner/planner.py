@@ -302,13 +302,12 @@ class InpaintingPlanner(nn.Module):
         n = len(observation)
         action_history = finite_tensor("action_history", action_history, (n, self.max_delay, self.act_dim), self.device)
         delay = checked_delay(delay, n, self.max_delay).to(self.device)
-        given = inpainting.known_window(observation, action_history, delay, self.window_length)
-        states, actions = given.split(self.sizes, dim=-1)
-        known = inpainting.known_mask(delay, self.window_length, self.obs_dim, self.act_dim)
-        guess = self._guess(states, actions, delay, known)
-        assert guess is not None  # for mypy: there is a first guess
-        z, action, _ = guess[th.arange(n, device=self.device), delay].split([*self.sizes, self.obs_dim], dim=-1)
-        return th.where(delay[:, None] == 0, observation, self.normalizer.denormalize_states(z)), action
+        length = int(delay.max()) + self.config.horizon
+        given = inpainting.known_window(observation, action_history, delay, length)
+        known = inpainting.known_mask(delay, length, self.obs_dim, self.act_dim)
+        states, actions = self._guess_window(given, known, delay)
+        rows = th.arange(n, device=self.device)
+        return states[rows, delay], actions[rows, delay]
 
     def _can_be_recorded(self, value_fn: ValueFn | None) -> bool:
         return self.device.type == "cuda" and (value_fn is None or isinstance(_owner(value_fn), nn.Module))
@@ -402,11 +401,7 @@ class InpaintingPlanner(nn.Module):
 
         The arguments are those of :meth:`_inpaint`, and what it makes of them.
         """
-        states, actions = given.split(self.sizes, dim=-1)  # (B, L, obs_dim), (B, L, act_dim)
-        guess = self._guess(states, actions, delay, known)
-        assert guess is not None  # for mypy: the config has seen to it
-        guessed = self.normalizer.denormalize_states(guess[..., : self.obs_dim])
-        states = th.where(known[..., :1], states, guessed)
+        states, actions = self._guess_window(given, known, delay)[0], given[..., self.obs_dim :]
         rows, now = th.arange(len(x), device=x.device), th.zeros_like(delay)
         ahead = x[:, :, : self.config.horizon]
         plan = self._inpaint(steps, value_fn, 0, False, times, states[rows, delay], action_history, now, ahead)
@@ -418,6 +413,18 @@ class InpaintingPlanner(nn.Module):
             for past, part in ((states, plan.states), (actions, plan.actions))
         )
         return Plan(plan.action, plan.present, states, actions, plan.values)
+
+    def _guess_window(self, given: th.Tensor, known: th.Tensor, delay: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Return the first guess in environment units: states (B, L, obs_dim), known ones as given, and actions.
+
+        :param given: (B, L, obs_dim + act_dim)
+        :param known: (B, L, obs_dim + act_dim) bool
+        """
+        states, actions = given.split(self.sizes, dim=-1)
+        guess = self._guess(states, actions, delay, known)
+        assert guess is not None  # for mypy: the callers have seen to it
+        z, actions, _ = guess.split([*self.sizes, self.obs_dim], dim=-1)
+        return th.where(known[..., :1], states, self.normalizer.denormalize_states(z)), actions
 
     def _guess(self, states: th.Tensor, actions: th.Tensor, delay: th.Tensor, known: th.Tensor) -> th.Tensor | None:
         """Return what the network is shown of the first guess: (B, L, 2 * obs_dim + act_dim), z-scored, or None.

@@ -182,8 +182,8 @@ class PlannerTrainer:
         :param should_stop: asked after every update; where it says so, this trainer is of no use any more
         :return: whether there is one, or none is asked for; False where ``should_stop`` has ended it
         """
-        guess, is_made = self.online.first_guess, self.n_updates > 0 or self._has_guessed
-        if is_made or guess is None or self.average.first_guess is None:
+        guess = self.online.first_guess
+        if guess is None or self.n_updates > 0 or self._has_guessed:
             return True
         passes = -(-GUESS_PASSES * len(self.source) // GUESS_BATCH_SIZE)
         n_updates = min(GUESS_UPDATES, GUESS_UPDATES_EACH * self.gradient_steps, passes)
