@@ -14,7 +14,7 @@ from sb3_said.planner.values import VALUE_SCALES
 #: Settings that shape a planner's answers and none of its weights.
 SAMPLING_SETTINGS = ("sampling_steps", "n_candidates", "temperature", "scored_states", "choice_factor", "present")
 CHOICES: dict[str, tuple[str, ...]] = {
-    "first_guess": ("residual", "prior", "plain", "none"),
+    "first_guess": ("prior", "plain", "none"),
     "prediction": PREDICTIONS,
     "schedule": SCHEDULES,
     "time_sampling": TIME_SAMPLINGS,
@@ -47,9 +47,9 @@ class PlannerConfig:
     embed_known: bool = True  # measured: buys as much accuracy as doubling the depth
     # What plain networks make of what is known: the states since by a model of one step, and a clone's action. "prior":
     # the network predicts what this guess does not, so that a planner begins as good as it (measured on logs and on an
-    # expert's replay, results/nine_logs.md and results/what_diffusion_buys.md). "residual": the guess is shown to the
-    # network, and no more. "plain": the same with a weaker model. "none" is the paper's. Files saved before there was a
-    # choice have True and False, for "plain" and "none"
+    # expert's replay, results/nine_logs.md and results/what_diffusion_buys.md). "plain": the guess of a weaker model is
+    # shown to the network, and no more; files saved before there was a choice have True for it, and False for "none",
+    # which is the paper's
     first_guess: str = "prior"
     # Diffusion
     prediction: str = "v"  # measured: safe with few steps; or "epsilon" (paper)

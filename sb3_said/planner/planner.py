@@ -73,7 +73,7 @@ class InpaintingPlanner(nn.Module):
         )
         self.first_guess = self.prior = None
         if config.first_guess != "none":
-            self.first_guess = FirstGuess(obs_dim, act_dim, config.first_guess != "plain")
+            self.first_guess = FirstGuess(obs_dim, act_dim, config.first_guess == "prior")
         if config.first_guess == "prior":
             self.prior = Prior(max_delay, self.window_length, obs_dim + act_dim)
         self.normalizer = Normalizer(

@@ -17,7 +17,7 @@ SMALL = PlannerConfig(
     n_candidates=5,
     temperature=0.5,
     scored_states="future",
-    first_guess="residual",
+    first_guess="plain",
     present="inpainted",
 )
 LENGTH = DELAY + SMALL.horizon
