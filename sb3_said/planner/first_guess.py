@@ -64,16 +64,14 @@ class FirstGuess(nn.Module):
         action = self.clone(state).clamp(-1.0, 1.0)[:, None]  # (B, 1, act_dim)
         return th.cat([th.stack(guessed, dim=1), th.where(is_decided[..., None], action, 0.0)], dim=-1)
 
-    def loss(self, states: th.Tensor, actions: th.Tensor, follows: th.Tensor, weight: th.Tensor) -> th.Tensor:
-        """Return the model's loss plus the clone's mean squared error, in action units.
+    def clone_loss(self, states: th.Tensor, actions: th.Tensor, weight: th.Tensor) -> th.Tensor:
+        """Return the clone's mean squared error, in action units.
 
-        :param states: (B, 2, obs_dim); this and the next two as of the model's loss
+        :param states: (B, obs_dim)
         :param actions: (B, act_dim)
-        :param follows: (B,) bool
-        :param weight: (B,) factor of the clone's errors, as of the windows in the planner's loss
+        :param weight: (B,) factor of each error, as of the windows in the planner's loss
         """
-        of_clone = ((self.clone(states[:, 0]) - actions) ** 2).mean(-1)  # (B,)
-        return self.model.loss(states, actions, follows) + (of_clone * weight).mean()
+        return (((self.clone(states) - actions) ** 2).mean(-1) * weight).mean()
 
 
 def fit_first_guess(
@@ -85,16 +83,19 @@ def fit_first_guess(
     generator: th.Generator,
     progress_bar: bool = False,
     should_stop: Callable[[], bool] | None = None,
+    older: WindowSource | None = None,
 ) -> bool:
     """Train the plain networks with Adam, whose rate falls to 0 by a cosine.
 
-    :param guess: to train, on the device of the source
+    :param guess: to train, on the device of the sources
     :param source: windows whose values are those that weigh them
     :param normalizer: fitted to the source
     :param config: of the planner: how windows are drawn and weighed
     :param generator: of the batches
     :param progress_bar: show one
     :param should_stop: asked after every update
+    :param older: steps that make half of each of the model's batches, and none of the clone's: what policies did ages,
+        and how the task moves does not (a fifth to a quarter off the model's errors, results/what_diffusion_buys.md)
     :return: whether all updates were made
     """
     guess.model.move_std.copy_(normalizer.move_std[0])
@@ -106,9 +107,15 @@ def fit_first_guess(
     scheduler = th.optim.lr_scheduler.CosineAnnealingLR(optimizer, n_updates)
     for _ in tqdm(range(n_updates), desc="first guess", disable=not progress_bar):
         windows = source.sample(GUESS_BATCH_SIZE, 2, generator, config.early_probability)
-        states = normalizer.normalize_states(windows.states)
-        weight = window_weight(windows.values, config.weight_factor)
-        loss = guess.loss(states, windows.actions[:, 0], windows.valid[:, 1], weight)
+        states, actions, follows, values = windows
+        states = normalizer.normalize_states(states)
+        loss = guess.clone_loss(states[:, 0], actions[:, 0], window_weight(values, config.weight_factor))
+        if older is not None:
+            half = GUESS_BATCH_SIZE // 2
+            old = older.sample(half, 2, generator, config.early_probability)
+            states = th.cat([states[:half], normalizer.normalize_states(old.states)])
+            actions, follows = th.cat([actions[:half], old.actions]), th.cat([follows[:half], old.valid])
+        loss = loss + guess.model.loss(states, actions[:, 0], follows[:, 1])
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

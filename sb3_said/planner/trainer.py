@@ -81,6 +81,7 @@ class PlannerTrainer:
     :param gradient_steps: updates of the whole training, over which a cosine learning rate falls to 0
     :param held_out: fraction of the data that is kept for ``evaluate``, see ``WindowSource.split``; 0 for none
     :param seed: of every draw
+    :param older: windows of other steps, of which the first guess's model learns, too
     :raises ValueError: when ``source`` does not fit the planner, or cannot be split
     """
 
@@ -91,6 +92,7 @@ class PlannerTrainer:
         gradient_steps: int,
         held_out: float = 0.05,
         seed: int = 0,
+        older: WindowSource | None = None,
     ) -> None:
         if (source.obs_dim, source.act_dim) != (planner.obs_dim, planner.act_dim):
             raise ValueError(
@@ -118,11 +120,13 @@ class PlannerTrainer:
             "held_out": held_out,
             "seed": seed,
             "n_windows": len(source),
+            "n_older": 0 if older is None else len(older),
         }
 
         training_source, held_source = source.split(held_out, seed) if held_out > 0 else (source, None)
         values = scaled_values(training_source.values, self.config.value_scale)
         self.source = replace(training_source, values=values).to(self.device)
+        self.older = None if older is None else older.to(self.device)
         sizes = planner.obs_dim, planner.act_dim, planner.max_delay
         with th.random.fork_rng(devices=[]):  # initial weights are the only draws that take no generator
             th.manual_seed(seed)
@@ -188,7 +192,7 @@ class PlannerTrainer:
         passes = -(-GUESS_PASSES * len(self.source) // GUESS_BATCH_SIZE)
         n_updates = min(GUESS_UPDATES, GUESS_UPDATES_EACH * self.gradient_steps, passes)
         drawn = self.average.normalizer, self.config, n_updates, self.generator
-        if not fit_first_guess(guess, self.source, *drawn, progress_bar, should_stop):
+        if not fit_first_guess(guess, self.source, *drawn, progress_bar, should_stop, self.older):
             return False
         guess.requires_grad_(False)
         if self.online.prior is not None:

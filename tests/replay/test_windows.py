@@ -88,6 +88,10 @@ def test_every_window_is_a_piece_of_one_episode(
     assert_windows(source, naive_starts(rows[-n_rows:], n_envs, length), length)
     # Episodes are numbered apart, also where two end at the same time
     assert len(source.episodes.unique()) == sum(len(naive_episodes(rows[-n_rows:], env)) for env in range(n_envs))
+    stored = rows[-steps_per_env:]
+    if n_rows < len(stored):
+        older = make_buffer(player, steps_per_env, rows).window_source(newest_fraction, older=True)
+        assert_windows(older, naive_starts(stored[:-n_rows], n_envs, length), length)
 
 
 @pytest.mark.parametrize("fraction", [0.0, -0.2, 1.1, float("nan")])
@@ -95,6 +99,12 @@ def test_bad_fractions_are_refused(fraction):
     player = Player()
     with pytest.raises(ValueError, match="newest_fraction"):
         make_buffer(player, 20, player.play(3)).window_source(fraction)
+
+
+def test_all_of_a_buffer_has_nothing_older():
+    player = Player()
+    with pytest.raises(ValueError, match="No step is older than the newest part, 1 of 3 steps"):
+        make_buffer(player, 20, player.play(3)).window_source(older=True)
 
 
 @pytest.mark.parametrize("n_envs", [1, 2])

@@ -391,8 +391,10 @@ def test_the_newest_part_of_the_buffer():
     trainer = model.make_planner_trainer()
     assert trainer._settings["n_windows"] == 20
     assert trainer.source.rows.min() >= 80
+    assert sorted(trainer.older.rows.tolist()) == list(range(80))  # of which the model of a step learns, too
     model.planner_newest_fraction = 1.0
-    assert model.make_planner_trainer()._settings["n_windows"] == 100
+    trainer = model.make_planner_trainer()
+    assert trainer._settings["n_windows"] == 100 and trainer.older is None
 
 
 @pytest.mark.parametrize("penalty", [-100.0, None])
