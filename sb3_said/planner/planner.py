@@ -229,7 +229,7 @@ class InpaintingPlanner(nn.Module):
         :param sampling_steps: denoising steps
         :param temperature: factor on the initial noise
         :param noise: (N, ``window_length``, obs_dim + act_dim) standard normal initial noise, shared by all decisions,
-            to repeat a plan
+            to repeat a plan; or one for each decision, (B, N, ``window_length``, obs_dim + act_dim)
         :param generator: of the initial noise where none is given; torch's global one by default
         :param state_history: (B, D, obs_dim), the states s_{t-D+1..t}, oldest first, any finite numbers where they are
             not known. Every candidate keeps those younger than s_{t-d}; older ones add nothing (Markov property) and
@@ -257,8 +257,9 @@ class InpaintingPlanner(nn.Module):
         temperature = config.temperature if temperature is None else temperature
         window = (length, self.obs_dim + self.act_dim)
         if noise is not None:
-            noise = finite_tensor("noise", noise, (n_candidates, self.window_length, window[1]), device)
-            n_candidates, noise = len(noise), noise[:, :length]
+            batch = (n,) if noise.ndim == 4 else ()
+            noise = finite_tensor("noise", noise, (*batch, n_candidates, self.window_length, window[1]), device)
+            n_candidates, noise = noise.shape[-3], noise[..., :length, :]
         elif n_candidates is None:
             n_candidates = 1 if value_fn is None else config.n_candidates
         if n_candidates < 1 or not temperature >= 0:
@@ -272,7 +273,7 @@ class InpaintingPlanner(nn.Module):
             x = th.zeros(n, 1, *window, device=device)
         else:
             noise = self._noise((n, n_candidates, *window), generator) if noise is None else noise
-            x = temperature * noise.expand(n, -1, -1, -1)  # (B, N, L, obs_dim + act_dim)
+            x = temperature * noise.expand(n, n_candidates, *window)  # (B, N, L, obs_dim + act_dim)
         times = th.tensor([step.t for step in steps], device=device)
         inputs = (times, observation, action_history, delay, x, *extra_states)
         if self._can_be_recorded(value_fn):

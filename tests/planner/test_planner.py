@@ -349,6 +349,18 @@ def test_noise_and_generator_repeat_a_plan():
     th.testing.assert_close(twice, half, atol=1e-4, rtol=1e-4)
 
 
+def test_each_decision_can_have_noise_of_its_own():
+    planner, noise = make_planner(), th.randn(6, 3, LENGTH, OBS + ACT)
+    batch = make_batch(6)
+    together = planner.plan(*batch, noise=noise)
+    for b in range(6):
+        alone = planner.plan(*(x[b : b + 1] for x in batch), noise=noise[b])
+        length = alone.states.shape[2]
+        th.testing.assert_close(alone.states[0], together.states[b, :, :length], atol=1e-4, rtol=1e-4)
+    with pytest.raises(ValueError, match=r"noise has the shape \(5, 3"):
+        planner.plan(*batch, noise=noise[:5])
+
+
 def test_decisions_and_candidates_do_not_disturb_each_other():
     planner, noise = make_planner(), th.randn(3, LENGTH, OBS + ACT)
     observation, history, delay = make_batch(6)
