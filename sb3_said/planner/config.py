@@ -12,7 +12,9 @@ from sb3_said.planner.dit import HEAD_DIM
 from sb3_said.planner.values import VALUE_SCALES
 
 #: Settings that shape a planner's answers and none of its weights.
-SAMPLING_SETTINGS = ("sampling_steps", "n_candidates", "temperature", "scored_states", "choice_factor", "present")
+SAMPLING_SETTINGS = (
+    "sampling_steps", "n_candidates", "temperature", "scored_states", "choice_factor", "present", "decided_by"
+)  # fmt: skip
 CHOICES: dict[str, tuple[str, ...]] = {
     "first_guess": ("prior", "plain", "none"),
     "prediction": PREDICTIONS,
@@ -22,6 +24,7 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "action_transform": ("standard", "tanh"),
     "scored_states": ("future", "decision", "all"),
     "present": ("inpainted", "guessed"),
+    "decided_by": ("plan", "actor"),
     "lr_schedule": ("cosine", "constant"),
     "value_scale": VALUE_SCALES,
     "precision": ("auto", "float32", "bfloat16"),
@@ -92,6 +95,9 @@ class PlannerConfig:
     # as much on some (measured, results/nine_logs.md), as a decision from an old observation is nearer to the mean of
     # what may be right. None: "guessed" where there is a guess and ``mask`` knows age 0
     present: str | None = None
+    # "plan" (paper): the action that the plan has at the present; "actor": what SAID's expert does where it sees the
+    # guessed present, without delay; then no plan is made
+    decided_by: str = "plan"
     # Training
     learning_rate: float = 2e-3  # measured at depth 2, together with the warm-up
     lr_schedule: str = "cosine"  # paper: down to 0; or "constant"
@@ -155,6 +161,10 @@ class PlannerConfig:
             raise ValueError(
                 f"mask is 'none' with first_guess={self.first_guess!r} and present={self.present!r}; expected a "
                 "first_guess and present='guessed', as such a planner knows age 0 only."
+            )
+        if self.decided_by == "actor" and self.present != "guessed":
+            raise ValueError(
+                f"decided_by is 'actor' with present={self.present!r}; expected present='guessed', where it acts."
             )
 
     def to_dict(self) -> dict[str, Any]:

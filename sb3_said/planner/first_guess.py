@@ -95,7 +95,8 @@ def fit_first_guess(
     :param progress_bar: show one
     :param should_stop: asked after every update
     :param older: steps that make half of each of the model's batches, and none of the clone's: what policies did ages,
-        and how the task moves does not (a fifth to a quarter off the model's errors, results/what_diffusion_buys.md)
+        and how the task moves does not. Where the newest are few, a quarter off the model's errors, and nothing lost
+        where they are many (results/what_diffusion_buys.md)
     :return: whether all updates were made
     """
     guess.model.move_std.copy_(normalizer.move_std[0])

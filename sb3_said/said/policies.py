@@ -178,8 +178,8 @@ class SAIDPolicy(DelayedSACPolicy):
         """Let one of them answer ``predict`` for a while, whoever would otherwise.
 
         :param who: as of :meth:`set_answer`
-        :param at_once: answer the rows of a batch together where no noise is drawn: several times as fast, but an
-            answer then differs by rounding from that to the row alone
+        :param at_once: answer the rows of a batch together: several times as fast, but an answer then differs by
+            rounding from that to the row alone
         :raises ValueError: for another name, for a planner that is not trained, for no student, or for ``"both"`` where
             no age was set
         """
@@ -253,9 +253,9 @@ class SAIDPolicy(DelayedSACPolicy):
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         who = self.who_answers
         if not deterministic and who != "both":
-            return self._plan(observation).action if who == "planner" else super()._predict(observation)
+            return self._decide(observation, who == "expert", deterministic)
         is_experts = self._is_experts(observation, who)  # (B,)
-        if not (self._at_once and self.planner.config.temperature == 0):
+        if not self._at_once:
             # Each row alone: products of another batch size round differently, and can change the candidate chosen
             rows = zip(rows_of(observation), is_experts, strict=True)
             return th.cat([self._decide(row, bool(is_one), deterministic) for row, is_one in rows])
@@ -272,9 +272,17 @@ class SAIDPolicy(DelayedSACPolicy):
 
     def _decide(self, observation: PyTorchObs, is_experts: bool, deterministic: bool) -> th.Tensor:
         """Let the expert or the planner decide for all rows: (B, act_dim)."""
-        if is_experts:
-            return super()._predict(observation, deterministic)
-        return self._plan(observation, repeats=deterministic).action
+        if not is_experts and self.planner.config.decided_by == "plan":
+            return self._plan(observation, repeats=deterministic).action
+        return super()._predict(observation if is_experts else self._as_if_seen(observation), deterministic)
+
+    def _as_if_seen(self, observation: PyTorchObs) -> PyTorchObs:
+        """Return observations of age 0, of the present that the planner's first guess has for each row."""
+        if not isinstance(observation, dict):
+            return observation
+        state, history, delay = (observation[key] for key in KEYS)
+        present, _ = self.planner.guess(state, history, delay[:, 0].long())
+        return {**observation, KEYS[0]: present, KEYS[2]: th.zeros_like(delay)}
 
     def _is_experts(self, observation: PyTorchObs, who: Answer) -> th.Tensor:
         """Tell for which observations the expert decides: (B,) bool.
@@ -294,7 +302,8 @@ class SAIDPolicy(DelayedSACPolicy):
         """Return the action that :meth:`predict` does, and those planned for the steps after it.
 
         Of candidates that are chosen from, they are the best one's; of weighed ones, their weighed mean, too. Where
-        ``"both"`` answer and the expert decides, the planner still plans what follows.
+        ``"both"`` answer and the expert decides, or its actor on the guessed present, the planner still plans what
+        follows.
 
         :param observation: (B, ...), as of ``predict``
         :return: (B, K, act_dim), in the units of the action space. K is the planner's ``horizon``; 1 where the planner
@@ -310,14 +319,15 @@ class SAIDPolicy(DelayedSACPolicy):
             plan = self._plan(row, repeats=deterministic)
             later = plan.actions[:, :, -config.horizon :]  # (1, N, K, act_dim)
             chosen = choose(later.flatten(2), plan.values, config.choice_factor).view(1, *later.shape[2:])
-            first = super()._predict(row, deterministic) if self._is_experts(row, who) else plan.action
+            is_experts, is_plans = bool(self._is_experts(row, who)), config.decided_by == "plan"
+            first = plan.action if is_plans and not is_experts else self._decide(row, is_experts, deterministic)
             planned.append(th.cat([first[:, None], chosen[:, 1:]], dim=1))
         return self._checked(self.unscale_action(th.cat(planned).cpu().numpy()), observation)
 
     def _plan(self, observation: PyTorchObs, repeats: bool = False) -> Plan:
         """Plan for each row.
 
-        :param repeats: let the observation, of one row, decide the noise
+        :param repeats: let each row decide its noise
         """
         extra: dict[str, Any] = {}
         if isinstance(observation, dict):
@@ -333,7 +343,7 @@ class SAIDPolicy(DelayedSACPolicy):
             history,
             delay,
             value_fn=self.value if chooses else None,
-            noise=self._noise_of(observation) if chooses and repeats else None,
+            noise=th.stack([*map(self._noise_of, rows_of(observation))]) if chooses and repeats else None,
             **extra,
         )
 

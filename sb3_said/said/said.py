@@ -197,10 +197,11 @@ class SAID(OfflineAlgorithm, StableSAC):
 
         ``model.set_planner(temperature=0.3, n_candidates=50)``
 
-        :param settings: ``sampling_steps``, ``n_candidates``, ``temperature``, ``scored_states``, ``choice_factor`` or
-            ``present`` of :class:`~sb3_said.planner.PlannerConfig`
-        :raises ValueError: for other settings, which the weights depend on, for values outside their range, and for
-            ``scored_states="decision"`` where V(s) scores, in which no action shows
+        :param settings: ``sampling_steps``, ``n_candidates``, ``temperature``, ``scored_states``, ``choice_factor``,
+            ``present`` or ``decided_by`` of :class:`~sb3_said.planner.PlannerConfig`
+        :raises ValueError: for other settings, which the weights depend on, for values outside their range, for
+            ``scored_states="decision"`` where V(s) scores, in which no action shows, and for ``decided_by="actor"``
+            where no expert has learned
         """
         if others := sorted(set(settings) - set(SAMPLING_SETTINGS)):
             raise ValueError(
@@ -212,6 +213,8 @@ class SAID(OfflineAlgorithm, StableSAC):
                 "scored_states='decision' scores candidates at the present that they share, where V(s) tells no action "
                 "from another: use 'future' or 'all'."
             )
+        if settings.get("decided_by") == "actor" and self._n_updates == 0:
+            raise ValueError("decided_by='actor' lets the expert's actor decide, which this agent has not trained.")
         self.policy.planner.config = replace(self.policy.planner.config, **settings)
 
     def set_answer(self, who: Answer, expert_up_to: int | None = None) -> None:
@@ -227,8 +230,10 @@ class SAID(OfflineAlgorithm, StableSAC):
         who = self.policy.who_answers
         if who != "expert":  # masks were drawn from all of 0..D, so it has met every age
             self.policy.planner.check_ages(ages)
-        if who in ("expert", "both"):
-            super().check_ages([age for age in ages if who == "expert" or age < self.policy.expert_ages])
+        acts_at = [age for age in ages if who == "expert" or (who == "both" and age < self.policy.expert_ages)]
+        if who in ("planner", "both") and self.policy.planner.config.decided_by == "actor":
+            acts_at.append(0)  # on the present, as if it saw it
+        super().check_ages(acts_at)
 
     def distill(self, width: int = 256, progress_bar: bool = False, **settings: Any) -> float:
         """Train a student: a plain network that answers as the planner does at temperature 0, much faster.

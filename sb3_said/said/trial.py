@@ -17,12 +17,14 @@ from sb3_said.planner.config import SAMPLING_SETTINGS, PlannerConfig
 
 SAID = Any  # whose module imports this one
 
-#: What a trial compares with an agent's own settings: the default's steps, a single step, and the mean of all
-#: candidates, weighed by the critics. Which is best depends on task, delay and budget (measured, results/settings.md).
+#: What a trial compares with an agent's own settings: the default's steps, a single step, the mean of all candidates,
+#: weighed by the critics, and the expert's actor on the present that the planner's first guess has. Which is best
+#: depends on task, delay and budget (measured, results/settings.md and results/what_diffusion_buys.md).
 WAYS: dict[str, dict[str, Any]] = {
-    "default": {"temperature": 0.0, "sampling_steps": PlannerConfig.sampling_steps},
-    "one_step": {"temperature": 0.0, "sampling_steps": 1},
-    "weighed": {"temperature": 1.0, "sampling_steps": 2, "choice_factor": 1.0},
+    "default": {"decided_by": "plan", "temperature": 0.0, "sampling_steps": PlannerConfig.sampling_steps},
+    "one_step": {"decided_by": "plan", "temperature": 0.0, "sampling_steps": 1},
+    "weighed": {"decided_by": "plan", "temperature": 1.0, "sampling_steps": 2, "choice_factor": 1.0},
+    "actor": {"decided_by": "actor"},
 }
 
 
@@ -46,7 +48,10 @@ def ways_of(given: dict[str, dict[str, Any]] | None, planner_kwargs: dict[str, A
     :raises ValueError: for other settings than those of ``set_planner``, and for values outside their range
     """
     if given is None:
-        return {} if set(SAMPLING_SETTINGS) & set(planner_kwargs) else WAYS
+        if set(SAMPLING_SETTINGS) & set(planner_kwargs):
+            return {}
+        can_guess = PlannerConfig(**planner_kwargs).present == "guessed"
+        return {name: way for name, way in WAYS.items() if can_guess or way["decided_by"] == "plan"}
     for name, settings in given.items():
         if name in ("planner", "expert") or not set(settings) <= set(SAMPLING_SETTINGS):
             raise ValueError(
@@ -62,7 +67,8 @@ def play_trial(
 ) -> Trial:
     """Play the training environment with the planner, in each of its ways, and with the expert, from the same seed.
 
-    These are environment steps beyond those of ``learn``.
+    These are environment steps beyond those of ``learn``. An expert that has not learned at age 0, as one of a fixed
+    delay, does not try to act on a guessed present.
 
     :param model: with a trained planner and an environment; stays as it is
     :param n_episodes: for each
@@ -72,7 +78,8 @@ def play_trial(
     """
     seed, own = int(np.random.randint(2**31)), model.policy.planner.config
     ways = {name: replace(own, **settings) for name, settings in model.planner_ways.items()}
-    others = {name: config for name, config in ways.items() if config != own}
+    can_act = 0 in (model.trained_ages or []) and model.policy.max_delay > 0  # without delay the actor is the expert
+    others = {name: way for name, way in ways.items() if way != own and (way.decided_by == "plan" or can_act)}
     returns, ages, n_steps = {}, {}, 0
     try:
         with model.borrowed_env() as env:

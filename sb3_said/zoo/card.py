@@ -178,10 +178,16 @@ def who_answers(model: Any) -> str:
     who, config = model.policy.who_answers, model.policy.planner.config
     if who not in ("planner", "both"):
         return who
-    how = f"in {config.sampling_steps} denoising step{'s' * (config.sampling_steps > 1)}"
-    how += f" at temperature {config.temperature:g}" + f", {config.n_candidates} candidates" * bool(config.temperature)
+    if config.decided_by == "actor":
+        how = "'s guess of the present, on which the expert acts"
+    else:
+        how = f" in {config.sampling_steps} denoising step{'s' * (config.sampling_steps > 1)}"
+        how += f" at temperature {config.temperature:g}"
+        how += f", {config.n_candidates} candidates" * bool(config.temperature)
     return (
-        f"the expert up to age {model.policy.expert_up_to}, else the planner {how}" if who == "both" else f"{who} {how}"
+        f"{who}{how}"
+        if who == "planner"
+        else f"the expert up to age {model.policy.expert_up_to}, else the planner{how}"
     )
 
 

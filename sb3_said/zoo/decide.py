@@ -51,6 +51,8 @@ def main(argv: list[str] | None = None) -> None:
                         "future or all")  # fmt: skip
     parser.add_argument("--present", metavar="WHICH", help="where a plan starts: inpainted, with the plan, or guessed "
                         "before it")  # fmt: skip
+    parser.add_argument("--decided-by", metavar="WHO", help="who decides at the present: plan, or actor: the expert "
+                        "on the guessed present")  # fmt: skip
     parser.add_argument("--answer", choices=ANSWERS, help="who acts; both: the expert while the observation is young, "
                         "and the planner where it is older")  # fmt: skip
     parser.add_argument("--expert-up-to", type=int, metavar="AGE", help="with --answer both: the largest age at which "
@@ -78,7 +80,11 @@ def main(argv: list[str] | None = None) -> None:
     config = model.policy.planner.config
     for name in SAMPLING_SETTINGS:
         print(f"{name:14} {getattr(config, name)}" + "  (new)" * (name in settings))
-    if config.temperature == 0:
+    if config.decided_by == "actor":
+        print(
+            "The expert acts on the guessed present, and nothing is planned: the settings above present change nothing."
+        )
+    elif config.temperature == 0:
         print("At temperature 0 there is one candidate: n_candidates, scored_states and choice_factor change nothing.")
     if not model.policy.planner_is_trained:
         print("The planner of this agent is not trained yet.")

@@ -44,7 +44,7 @@ class DepthPlanners:
         self.dataset = dataset
         self.model, self.checkpoint, self.folder, self.progress_bar = model, checkpoint, folder, progress_bar
         self.gradient_steps = gradient_steps or model.planner_gradient_steps
-        self.config = model.policy.planner.config
+        self.config = replace(model.policy.planner.config, decided_by="plan")  # else the tries would all be alike
         serves = int(model.policy.planner_updates) == self.gradient_steps
         self._own = model.policy.planner if serves else None
 

@@ -23,6 +23,7 @@ def test_paper_config_is_the_papers_table():
 def test_settings_of_sampling_do_not_decide_the_weights():
     config = PlannerConfig()
     others = dict(sampling_steps=1, n_candidates=2, temperature=1.0, scored_states="all", choice_factor=1.0)
+    others["decided_by"] = "actor"
     assert dataclasses.replace(config, **others).weight_settings() == config.weight_settings()
     assert dataclasses.replace(config, depth=4).weight_settings() != config.weight_settings()
 
@@ -54,6 +55,8 @@ def test_config_survives_json():
         ({"mask": "none", "first_guess": "none"}, "mask is 'none' with first_guess='none' and present='inpainted'"),
         ({"mask": "none", "present": "inpainted"}, "mask is 'none' .* present='inpainted'; expected a first_guess"),
         ({"present": "seen"}, "present is 'seen', expected one of"),
+        ({"decided_by": "critic"}, "decided_by is 'critic', expected one of"),
+        ({"decided_by": "actor", "present": "inpainted"}, "decided_by is 'actor' .* expected present='guessed'"),
         ({"action_transform": "log"}, "action_transform is 'log'"),
         ({"scored_states": "past"}, "scored_states is 'past'"),
         ({"value_scale": "log"}, "value_scale is 'log'"),

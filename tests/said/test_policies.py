@@ -422,6 +422,48 @@ def test_of_both_the_expert_answers_young_observations_and_the_planner_old_ones(
     assert not np.array_equal(first, expected)
 
 
+@pytest.mark.parametrize("how", [{"temperature": 0.0}, {"temperature": 1.0, "choice_factor": 1.0}])
+def test_rows_that_are_answered_at_once_are_answered_as_each_alone(saved, how):
+    model, obs = SAID.load(saved, device="cpu"), observe()
+    model.set_planner(**how)
+    expected = answer(model, obs)
+    for who in ("planner", "both"):
+        if who == "both":
+            model.set_answer("both", expert_up_to=0)
+            expected = answer(model, obs)
+        with model.policy.answering(who, at_once=True):
+            np.testing.assert_allclose(answer(model, obs), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_the_actor_decides_on_the_guessed_present_as_if_it_saw_it(saved, tmp_path):
+    model, obs = SAID.load(saved, device="cpu"), observe()
+    model.set_planner(decided_by="actor")
+    state, history, delay = (th.as_tensor(obs[key]) for key in ("observation", "action_history", "delay"))
+    guessed = model.policy.planner.guess(state, history, delay[:, 0].long())[0].numpy()
+    assert not np.allclose(guessed[2:], obs["observation"][2:]) and obs["delay"].max() == 2
+    with model.policy.answering("expert"):
+        expected = answer(model, {**obs, "observation": guessed, "delay": np.zeros_like(obs["delay"])})
+        assert not np.allclose(expected[1:], answer(model, obs)[1:])
+    np.testing.assert_allclose(answer(model, obs), expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal([answer(model, row) for row in rows_of(obs)], answer(model, obs))
+    with model.policy.answering("planner", at_once=True):
+        np.testing.assert_allclose(answer(model, obs), expected, rtol=1e-5, atol=1e-6)
+    plans = model.predict_plan(obs, deterministic=True)
+    np.testing.assert_array_equal(plans[:, 0], answer(model, obs))
+    model.save(tmp_path / "actor.zip")
+    np.testing.assert_array_equal(answer(SAID.load(tmp_path / "actor.zip", device="cpu"), obs), answer(model, obs))
+    with pytest.warns(UserWarning, match="learned at ages 2 and is given 0"):  # by the guess
+        model.check_ages([2])
+    model.set_planner(decided_by="plan")
+    np.testing.assert_array_equal(model.predict_plan(obs, deterministic=True)[:, 1:], plans[:, 1:])
+    assert not np.allclose(answer(model, obs), plans[:, 0])
+
+
+def test_no_actor_that_has_not_learned_decides():
+    with pytest.raises(ValueError, match="decided_by='actor' lets the expert's actor decide, which this agent has not"):
+        make().set_planner(decided_by="actor")
+
+
 def test_both_need_an_age_and_keep_what_each_has_met(saved, tmp_path):
     model = SAID.load(saved, device="cpu")
     max_delay = model.policy.max_delay

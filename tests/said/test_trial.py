@@ -33,7 +33,7 @@ def pendulum(n_steps=15, delay=2):
 
 @pytest.fixture(scope="module")
 def trained():
-    return make(env=pendulum(), planner_ways=trial.WAYS).learn(60)
+    return make(env=pendulum(delay=(0, 2)), planner_ways=trial.WAYS).learn(60)
 
 
 def test_returns_are_those_of_each_who_can_answer(trained):
@@ -43,18 +43,24 @@ def test_returns_are_those_of_each_who_can_answer(trained):
     played = found.returns
     np.random.seed(3)
     seed = int(np.random.randint(2**31))
-    assert list(played) == ["planner", "default", "one_step", "weighed", "expert"] and found.n_steps == 5 * 3 * 15
-    np.testing.assert_array_equal(found.ages, [2, 2, 2])
+    assert list(played) == ["planner", "default", "one_step", "weighed", "actor", "expert"]
+    assert found.n_steps == 6 * 3 * 15
+    assert set(found.ages) <= {0, 1, 2}
     assert trained.policy.planner.config == before
     for name, returns in played.items():
-        env = DummyVecEnv([lambda: Monitor(pendulum())])
+        env = DummyVecEnv([lambda: Monitor(pendulum(delay=(0, 2)))])
         env.seed(seed)
         trained.set_planner(**trial.WAYS.get(name, {}))
         with trained.policy.answering("expert" if name == "expert" else "planner"):
             expected = evaluate_policy(trained, env, 3, return_episode_rewards=True)[0]
         trained.policy.planner.config = before
         np.testing.assert_allclose(returns, expected, rtol=1e-5)
-    assert len({returns[0] for returns in played.values()}) == 5
+    assert len({returns[0] for returns in played.values()}) == 6
+
+
+def test_an_expert_that_has_not_learned_without_delay_acts_on_no_guess():
+    model = make(env=pendulum(delay=2), planner_ways={"actor": trial.WAYS["actor"]}).learn(60)
+    assert list(trial.play_trial(model, n_episodes=1).returns) == ["planner", "expert"]
 
 
 def test_the_monitor_file_holds_the_training_and_not_the_trial(tmp_path):
@@ -73,7 +79,7 @@ def test_a_way_that_the_planner_already_has_is_not_played_twice_and_the_way_back
         returns = trial.play_trial(trained, n_episodes=1).returns
     finally:
         trained.policy.planner.config = own
-    assert list(returns) == ["planner", "default", "weighed", "expert"]
+    assert list(returns) == ["planner", "default", "weighed", "actor", "expert"]
 
 
 @pytest.mark.parametrize(("means", "answers"), [((1, 2, 3, 0), "planner"), ((3, 2, 1, 4), "expert")])
@@ -175,6 +181,8 @@ def test_both_answer_where_each_does_better(monkeypatch, tmp_path):
 def test_ways_that_are_given_are_checked_and_settings_of_the_users_own_are_kept():
     tiny = {"planner_kwargs": {"depth": 1, "d_model": 32}, "buffer_size": 100, "device": "cpu"}
     assert SAID("MlpPolicy", delayed(), **tiny).planner_ways == trial.WAYS
+    blind = SAID("MlpPolicy", delayed(), **{**tiny, "planner_kwargs": {"d_model": 32, "first_guess": "none"}})
+    assert blind.planner_ways == {name: way for name, way in trial.WAYS.items() if name != "actor"}
     assert make().planner_ways == {}  # it has a temperature
     assert make(planner_ways={}).planner_ways == {}
     for wrong in ({"x": {"depth": 4}}, {"expert": {"temperature": 0.1}}, {"x": {"temperature": -1.0}}):
