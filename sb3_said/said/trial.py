@@ -17,14 +17,15 @@ from sb3_said.planner.config import SAMPLING_SETTINGS, PlannerConfig
 
 SAID = Any  # whose module imports this one
 
-#: What a trial compares with an agent's own settings: the default's steps, a single step, the mean of all candidates,
-#: weighed by the critics, and the expert's actor on the present that the planner's first guess has. Which is best
-#: depends on task, delay and budget (measured, results/settings.md and results/what_diffusion_buys.md).
+#: What a trial compares with an agent's own settings: the mean of all candidates, weighed by the critics; the expert's
+#: actor on the present that the planner's first guess has; the default's steps; and a single step. Which is best
+#: depends on task, delay and budget (measured, results/what_diffusion_buys.md and results/settings.md). Where the trial
+#: cannot tell, the order does: the first was best or second with each of seven planners.
 WAYS: dict[str, dict[str, Any]] = {
-    "default": {"decided_by": "plan", "temperature": 0.0, "sampling_steps": PlannerConfig.sampling_steps},
-    "one_step": {"decided_by": "plan", "temperature": 0.0, "sampling_steps": 1},
     "weighed": {"decided_by": "plan", "temperature": 1.0, "sampling_steps": 2, "choice_factor": 1.0},
     "actor": {"decided_by": "actor"},
+    "default": {"decided_by": "plan", "temperature": 0.0, "sampling_steps": PlannerConfig.sampling_steps},
+    "one_step": {"decided_by": "plan", "temperature": 0.0, "sampling_steps": 1},
 }
 
 
@@ -160,7 +161,8 @@ def let_the_best_answer(
 ) -> dict[str, float]:
     """Let the planner in its best way answer, or the expert, or both: the expert at the ages at which it does better.
 
-    Both answer where that :func:`gains_more_than_its_error` over either alone. Warn where the expert alone does.
+    Of ways over which the best one gains no more than its error, the first of ``planner_ways`` is taken. Both answer
+    where that :func:`gains_more_than_its_error` over either alone. Warn where the expert alone does.
 
     :return: mean returns, the expert's largest age, and the number of steps played, for the log
     """
@@ -172,7 +174,9 @@ def let_the_best_answer(
     way = max(ways, key=lambda name: shares[name][0])
     up_to = shares[way][1]
     if not gains_more_than_its_error(np.where(trial.ages <= up_to, expert, trial.returns[way]), trial.returns[alone]):
-        way = max(ways, key=lambda name: trial.returns[name].mean())
+        best = trial.returns[max(ways, key=lambda name: trial.returns[name].mean())]
+        in_order = [name for name in (*model.planner_ways, "planner") if name in ways]
+        way = next(name for name in in_order if not gains_more_than_its_error(best, trial.returns[name]))
         up_to = np.inf if alone == "expert" else -1.0
     model.set_planner(**model.planner_ways.get(way, {}))
     if 0 <= up_to < model.policy.max_delay:

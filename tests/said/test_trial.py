@@ -43,7 +43,7 @@ def test_returns_are_those_of_each_who_can_answer(trained):
     played = found.returns
     np.random.seed(3)
     seed = int(np.random.randint(2**31))
-    assert list(played) == ["planner", "default", "one_step", "weighed", "actor", "expert"]
+    assert list(played) == ["planner", "weighed", "actor", "default", "one_step", "expert"]
     assert found.n_steps == 6 * 3 * 15
     assert set(found.ages) <= {0, 1, 2}
     assert trained.policy.planner.config == before
@@ -79,7 +79,7 @@ def test_a_way_that_the_planner_already_has_is_not_played_twice_and_the_way_back
         returns = trial.play_trial(trained, n_episodes=1).returns
     finally:
         trained.policy.planner.config = own
-    assert list(returns) == ["planner", "default", "weighed", "actor", "expert"]
+    assert list(returns) == ["planner", "weighed", "actor", "default", "expert"]
 
 
 @pytest.mark.parametrize(("means", "answers"), [((1, 2, 3, 0), "planner"), ((3, 2, 1, 4), "expert")])
@@ -96,6 +96,19 @@ def test_the_planner_decides_in_its_best_way_whoever_answers(means, answers, mon
     model.save(tmp_path / "agent.zip")
     loaded = SAID.load(tmp_path / "agent.zip", device="cpu")
     assert loaded.policy.planner.config == config and loaded.planner_ways == ways
+
+
+def test_of_ways_that_the_trial_cannot_tell_apart_the_first_is_taken(monkeypatch):
+    """The last is the best by less than the error of that over b, and by more than that over a."""
+    base, gain = np.array([10.0, -7.0, 3.0, 3.0]), np.array([0.0, 2.0, 0.0, 2.0])  # error 0.577, as below
+    played = {"planner": base - 9.0, "a": base - 0.6, "b": base + 0.5, "c": base + gain, "expert": base - 9.0}
+    monkeypatch.setattr(trial, "play_trial", lambda *_: trial.Trial(played, np.full(4, 2.0), 7))
+    ways = {name: {"n_candidates": n} for n, name in enumerate("abc", 5)}
+    chosen = [
+        make(planner_trial_episodes=2, planner_ways={name: ways[name] for name in order}).learn(60).planner_kwargs
+        for order in ("abc", "acb")
+    ]
+    assert [settings["n_candidates"] for settings in chosen] == [6, 7]
 
 
 def test_episodes_of_several_environments_are_the_same_ones_whoever_ends_first():
