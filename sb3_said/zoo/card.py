@@ -62,12 +62,15 @@ def main(argv: list[str] | None = None) -> None:
 
 
 def trial_steps(folder: Path) -> int:
-    """Return the environment steps that a run's trials took beyond those of ``learn``, as its log has them."""
-    file = folder / "progress.csv"
-    if not file.is_file():
-        return 0
-    with file.open(newline="") as rows:
-        return sum(int(float(row.get("trial/steps") or 0)) for row in csv.DictReader(rows))
+    """Return the environment steps that a run's trials took beyond those of ``learn``, as its logs have them.
+
+    There is a log for each resume.
+    """
+    steps = 0
+    for file in folder.glob("progress*.csv"):
+        with file.open(newline="") as rows:
+            steps += sum(int(float(row.get("trial/steps") or 0)) for row in csv.DictReader(rows))
+    return steps
 
 
 def make_card(

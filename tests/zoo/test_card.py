@@ -81,6 +81,8 @@ def test_the_trials_steps_are_those_of_the_log(tmp_path: Path) -> None:
     assert card.trial_steps(tmp_path) == 0
     (tmp_path / "progress.csv").write_text("time,trial/steps,x\n1,,2\n2,340.0,\n3,60.0,\n")
     assert card.trial_steps(tmp_path) == 400
+    (tmp_path / "progress_2.csv").write_text("time,trial/steps\n4,7.0\n")  # of a resumed run
+    assert card.trial_steps(tmp_path) == 407
 
 
 def test_a_file_alone_names_its_task(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
