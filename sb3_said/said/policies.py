@@ -128,46 +128,56 @@ class SAIDPolicy(DelayedSACPolicy):
             return self._answer
         if self.student is not None and self.student.preferred:
             return "student"
-        if not self.planner_is_trained or self.expert_ages > self.max_delay:
+        if not self.planner_is_trained or len(self.expert_ages) == self.max_delay + 1:
             return "expert"
-        return "both" if self.expert_ages > 0 else "planner"
+        return "both" if self.expert_ages else "planner"
 
     @property
     def answers(self) -> list[Answer]:
         """Who can answer ``predict``."""
         can = {"planner": self.planner_is_trained, "expert": True, "student": self.student is not None}
-        can["both"] = self.planner_is_trained and self.expert_up_to is not None
+        can["both"] = self.planner_is_trained and 0 < len(self.expert_ages) <= self.max_delay
         return [who for who in get_args(Answer) if can[who]]
 
     @property
-    def expert_ages(self) -> int:
-        """How many ages, from 0 on, the expert answers at: 0 for the planner alone, D + 1 for the expert alone."""
-        return round(float(self.expert_preferred) * (self.max_delay + 1))
+    def expert_ages(self) -> range:
+        """The ages at which the expert answers: none for the planner alone, 0..D for the expert alone, in steps."""
+        n_ages = self.max_delay + 1
+        n = round(float(self.expert_preferred) * n_ages)
+        return range(n) if n >= 0 else range(n_ages + n, n_ages)
 
-    @property
-    def expert_up_to(self) -> int | None:
-        """Largest age at which the expert answers where ``"both"`` do, in control steps; None where none was set."""
-        return self.expert_ages - 1 if 0 < self.expert_ages <= self.max_delay else None
-
-    def set_answer(self, who: Answer, expert_up_to: int | None = None) -> None:
+    def set_answer(self, who: Answer, expert_up_to: int | None = None, expert_from: int | None = None) -> None:
         """Let one of them answer ``predict`` from now on, or two; a file keeps it.
 
-        :param who: ``"planner"``, ``"expert"``, ``"student"``, or ``"both"``: the expert where the observation is
-            young, the planner where it is older, and until an observation arrives that an action has led to
-        :param expert_up_to: with ``"both"``, the largest age at which the expert answers, in control steps
-        :raises ValueError: for another name, for a planner that is not trained, for no student, or for an
-            ``expert_up_to`` outside 0..max_delay - 1
+        Where two do, the one that has the oldest observations begins each episode, until an observation arrives that an
+        action has led to.
+
+        :param who: ``"planner"``, ``"expert"``, ``"student"``, or ``"both"``, each at ages of its own
+        :param expert_up_to: with ``"both"``, the largest age at which the expert answers, in control steps, and the
+            planner beyond
+        :param expert_from: in its place, the smallest age at which the expert answers, and the planner below
+        :raises ValueError: for another name, for a planner that is not trained, for no student, or for ages that leave
+            one of both without any
         """
         part = float(who == "expert")
+        given = {name: age for name, age in (("up_to", expert_up_to), ("from", expert_from)) if age is not None}
         if who == "both":
-            if expert_up_to is None or not 0 <= expert_up_to < self.max_delay:
+            n_ages = self.max_delay + 1
+            n = (
+                -(n_ages - expert_from)
+                if expert_from is not None
+                else 1 + (-1 if expert_up_to is None else expert_up_to)
+            )
+            if len(given) != 1 or not 0 < abs(n) < n_ages:
                 raise ValueError(
-                    f"expert_up_to is {expert_up_to}, expected an age in 0..{self.max_delay - 1}: the expert answers "
-                    "up to it, the planner beyond."
+                    f"expert_up_to is {expert_up_to} and expert_from {expert_from}, expected one of them: the expert "
+                    f"answers up to an age in 0..{self.max_delay - 1}, or from one in 1..{self.max_delay} on, and the "
+                    "planner at the others."
                 )
-            part = (expert_up_to + 1) / (self.max_delay + 1)
-        elif expert_up_to is not None:
-            raise ValueError(f"expert_up_to={expert_up_to} needs set_answer('both'), got {who!r}.")
+            part = n / n_ages
+        elif given:
+            name, age = next(iter(given.items()))
+            raise ValueError(f"expert_{name}={age} needs set_answer('both'), got {who!r}.")
         self._check_answer("planner" if who == "both" else who)
         self.expert_preferred.fill_(part)
         if self.student is not None:
@@ -196,8 +206,10 @@ class SAIDPolicy(DelayedSACPolicy):
         """Hold for a while, in what a file keeps, who answers inside :meth:`answering`."""
         parts = [self.expert_preferred] if self.student is None else [self.expert_preferred, self.student.preferred]
         before = [part.clone() for part in parts]
-        if self._answer is not None:
-            self.set_answer(self._answer, self.expert_up_to if self._answer == "both" else None)
+        if self._answer == "both" and self.student is not None:
+            self.student.preferred.fill_(0.0)  # the ages are there
+        elif self._answer is not None and self._answer != "both":
+            self.set_answer(self._answer)
         try:
             yield
         finally:
@@ -207,7 +219,7 @@ class SAIDPolicy(DelayedSACPolicy):
     def _check_answer(self, who: Answer) -> None:
         if who not in get_args(Answer):
             raise ValueError(f"Only the 'planner', the 'expert', 'both' or a 'student' can answer, got {who!r}.")
-        if who == "both" and self.expert_up_to is None:
+        if who == "both" and not 0 < len(self.expert_ages) <= self.max_delay:
             raise ValueError(
                 "Up to which age is the expert to answer? Call set_answer('both', expert_up_to=...) first."
             )
@@ -287,14 +299,16 @@ class SAIDPolicy(DelayedSACPolicy):
     def _is_experts(self, observation: PyTorchObs, who: Answer) -> th.Tensor:
         """Tell for which observations the expert decides: (B,) bool.
 
-        Where both do, the planner begins: while s_0 is all that has arrived, the age still grows, and a planner that
-        takes over from the expert amid its first steps falls (measured, results/agents.md).
+        Where both do, the one that decides at the largest age begins: while s_0 is all that has arrived, the age still
+        grows, and a planner that takes over from the expert amid its first steps falls (measured, results/agents.md).
         """
         if who == "both" and isinstance(observation, dict):
             history, age = observation[KEYS[1]], observation[KEYS[2]][:, 0].long()  # (B, D, act_dim), (B,)
             rows, steps = th.arange(len(age), device=age.device), (self.max_delay - 1 - age).clamp(min=0)
             led_there = history[rows, steps]  # a_{t-d-1}, zeros where s_{t-d} is s_0
-            return (age < self.expert_ages) & led_there.ne(0).any(1)
+            begins, ages = ~led_there.ne(0).any(1), self.expert_ages
+            is_its_age = (age >= ages.start) & (age < ages.stop)
+            return th.where(begins, self.max_delay in ages, is_its_age)
         n = len(observation[KEYS[0]] if isinstance(observation, dict) else observation)
         return th.full((n,), who == "expert", device=self.device)
 

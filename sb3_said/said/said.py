@@ -217,9 +217,9 @@ class SAID(OfflineAlgorithm, StableSAC):
             raise ValueError("decided_by='actor' lets the expert's actor decide, which this agent has not trained.")
         self.policy.planner.config = replace(self.policy.planner.config, **settings)
 
-    def set_answer(self, who: Answer, expert_up_to: int | None = None) -> None:
+    def set_answer(self, who: Answer, expert_up_to: int | None = None, expert_from: int | None = None) -> None:
         """Let one of them answer ``predict`` from now on, or two: see :meth:`SAIDPolicy.set_answer`."""
-        self.policy.set_answer(who, expert_up_to)
+        self.policy.set_answer(who, expert_up_to, expert_from)
 
     def check_ages(self, ages: list[int]) -> None:
         """Refuse ages that the planner cannot plan at, where it answers; warn as ``DelayedSAC`` where the expert does.
@@ -230,7 +230,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         who = self.policy.who_answers
         if who != "expert":  # masks were drawn from all of 0..D, so it has met every age
             self.policy.planner.check_ages(ages)
-        acts_at = [age for age in ages if who == "expert" or (who == "both" and age < self.policy.expert_ages)]
+        acts_at = [age for age in ages if who == "expert" or (who == "both" and age in self.policy.expert_ages)]
         if who in ("planner", "both") and self.policy.planner.config.decided_by == "actor":
             acts_at.append(0)  # on the present, as if it saw it
         super().check_ages(acts_at)

@@ -128,21 +128,22 @@ def _play(
     return np.asarray(played[0])[order], np.array([age for _, age in ended])[order], n_steps
 
 
-def best_share(planner: np.ndarray, expert: np.ndarray, ages: np.ndarray) -> tuple[float, float]:
-    """Return the best mean return with the expert up to an age and the planner beyond, and that age.
+def best_share(planner: np.ndarray, expert: np.ndarray, ages: np.ndarray) -> tuple[float, float, bool]:
+    """Return the best mean return that the two have together, the age that parts them, and whether the expert is below.
 
     The age is -1 for the planner alone, and infinite for the expert alone; between two ages that were played it is
-    midway.
+    midway, and the one below answers at it, too.
 
     :param planner: (n,) returns of episodes
     :param expert: (n,) returns of the same episodes
     :param ages: (n,) their ages
     """
     played = np.unique(ages)
-    ups = [-1.0, *np.floor((played[:-1] + played[1:]) / 2), np.inf]
-    means = [float(np.where(ages <= up, expert, planner).mean()) for up in ups]
+    between = np.floor((played[:-1] + played[1:]) / 2)
+    cuts = [(cut, True) for cut in (-1.0, *between, np.inf)] + [(cut, False) for cut in between]
+    means = [float(np.where((ages <= cut) == is_below, expert, planner).mean()) for cut, is_below in cuts]
     best = int(np.argmax(means))
-    return means[best], ups[best]
+    return means[best], *cuts[best]
 
 
 def gains_more_than_its_error(returns: np.ndarray, than: np.ndarray) -> bool:
@@ -159,12 +160,12 @@ def gains_more_than_its_error(returns: np.ndarray, than: np.ndarray) -> bool:
 def let_the_best_answer(
     model: SAID, n_episodes: int, progress_bar: bool = False, should_stop: Callable[[], bool] | None = None
 ) -> dict[str, float]:
-    """Let the planner in its best way answer, or the expert, or both: the expert at the ages at which it does better.
+    """Let the planner in its best way answer, or the expert, or both, each at the ages at which it does better.
 
     Of ways over which the best one gains no more than its error, the first of ``planner_ways`` is taken. Both answer
     where that :func:`gains_more_than_its_error` over either alone. Warn where the expert alone does.
 
-    :return: mean returns, the expert's largest age, and the number of steps played, for the log
+    :return: mean returns, the expert's ages, and the number of steps played, for the log
     """
     trial = play_trial(model, n_episodes, progress_bar, should_stop)
     expert = trial.returns["expert"]
@@ -172,18 +173,19 @@ def let_the_best_answer(
     shares = {name: best_share(trial.returns[name], expert, trial.ages) for name in ways}
     alone = max(trial.returns, key=lambda name: trial.returns[name].mean())
     way = max(ways, key=lambda name: shares[name][0])
-    up_to = shares[way][1]
-    if not gains_more_than_its_error(np.where(trial.ages <= up_to, expert, trial.returns[way]), trial.returns[alone]):
+    _, cut, is_below = shares[way]
+    together = np.where((trial.ages <= cut) == is_below, expert, trial.returns[way])
+    if not gains_more_than_its_error(together, trial.returns[alone]):
         best = trial.returns[max(ways, key=lambda name: trial.returns[name].mean())]
         in_order = [name for name in (*model.planner_ways, "planner") if name in ways]
         way = next(name for name in in_order if not gains_more_than_its_error(best, trial.returns[name]))
-        up_to = np.inf if alone == "expert" else -1.0
+        cut, is_below = (np.inf if alone == "expert" else -1.0), True
     model.set_planner(**model.planner_ways.get(way, {}))
-    if 0 <= up_to < model.policy.max_delay:
-        model.set_answer("both", int(up_to))
+    if 0 <= cut < model.policy.max_delay:
+        model.set_answer("both", **({"expert_up_to": int(cut)} if is_below else {"expert_from": int(cut) + 1}))
     else:
-        model.set_answer("planner" if up_to < 0 else "expert")
-    if np.isinf(up_to):
+        model.set_answer("planner" if cut < 0 else "expert")
+    if np.isinf(cut):
         warnings.warn(
             f"The planner is worse than its expert: mean returns of {trial.returns[way].mean():.5g} and "
             f"{expert.mean():.5g} over {n_episodes} episodes each. So the expert answers. More planner_gradient_steps "
@@ -191,5 +193,6 @@ def let_the_best_answer(
             stacklevel=3,
         )
     means = {f"trial/{name}_return": float(returns.mean()) for name, returns in trial.returns.items()}
-    last = float(min(up_to, model.policy.max_delay))
-    return means | {"trial/expert_up_to": last, "trial/steps": float(trial.n_steps)}
+    ages = model.policy.expert_ages  # up to -1 for none
+    share = {"trial/expert_from": float(ages.start), "trial/expert_up_to": float(ages.stop - 1)}
+    return means | share | {"trial/steps": float(trial.n_steps)}

@@ -190,7 +190,7 @@ def who_answers(model: Any) -> str:
     return (
         f"{who}{how}"
         if who == "planner"
-        else f"the expert up to age {model.policy.expert_up_to}, else the planner{how}"
+        else f"the expert at ages {written_ages([*model.policy.expert_ages])}, else the planner{how}"
     )
 
 

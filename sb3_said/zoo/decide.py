@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_said import SAID
+from sb3_said.delays.space import written_ages
 from sb3_said.files.normalization import normalization_file
 from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.zoo.arguments import TRUST, explained, make_parser
@@ -27,6 +28,9 @@ examples:
 
   # the expert while the observation is at most 4 steps old, the planner beyond
   sb3-said decide hopper.zip --answer both --expert-up-to 4 -o hopper_both.zip
+
+  # the planner up to 8 steps, the expert beyond: whichever is better where
+  sb3-said decide ant.zip --answer both --expert-from 9 -o ant_both.zip
 
   # the fastest decision: one candidate, one denoising step
   sb3-said decide hopper.zip --temperature 0 --sampling-steps 1 -o hopper_fast.zip
@@ -53,10 +57,12 @@ def main(argv: list[str] | None = None) -> None:
                         "before it")  # fmt: skip
     parser.add_argument("--decided-by", metavar="WHO", help="who decides at the present: plan, or actor: the expert "
                         "on the guessed present")  # fmt: skip
-    parser.add_argument("--answer", choices=ANSWERS, help="who acts; both: the expert while the observation is young, "
-                        "and the planner where it is older")  # fmt: skip
+    parser.add_argument("--answer", choices=ANSWERS, help="who acts; both: the expert at some ages of the observation, "
+                        "and the planner at the others")  # fmt: skip
     parser.add_argument("--expert-up-to", type=int, metavar="AGE", help="with --answer both: the largest age at which "
                         "the expert acts, in control steps")  # fmt: skip
+    parser.add_argument("--expert-from", type=int, metavar="AGE", help="in its place, the smallest age at which the "
+                        "expert acts")  # fmt: skip
     parser.add_argument(
         "-o", "--output", type=Path, metavar="ZIP", help="where to save the agent with its new settings"
     )
@@ -64,7 +70,8 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(argv)
     given = {name: getattr(args, name) for name in SAMPLING_SETTINGS if getattr(args, name) is not None}
     settings: dict[str, Any] = {name: None if value == "none" else value for name, value in given.items()}
-    sets_answer = args.answer is not None or args.expert_up_to is not None
+    expert_ages = args.expert_up_to, args.expert_from
+    sets_answer = args.answer is not None or expert_ages != (None, None)
     changes = bool(settings) or sets_answer
     with explained(parser):
         if changes and args.output is None:
@@ -76,7 +83,7 @@ def main(argv: list[str] | None = None) -> None:
         model = load_said(args.agent)
         model.set_planner(**settings)
         if sets_answer:
-            model.set_answer(args.answer or model.policy.who_answers, args.expert_up_to)
+            model.set_answer(args.answer or model.policy.who_answers, *expert_ages)
     config = model.policy.planner.config
     for name in SAMPLING_SETTINGS:
         print(f"{name:14} {getattr(config, name)}" + "  (new)" * (name in settings))
@@ -88,8 +95,8 @@ def main(argv: list[str] | None = None) -> None:
         print("At temperature 0 there is one candidate: n_candidates, scored_states and choice_factor change nothing.")
     if not model.policy.planner_is_trained:
         print("The planner of this agent is not trained yet.")
-    up_to = f": the expert up to age {model.policy.expert_up_to}" if model.policy.who_answers == "both" else ""
-    print(f"{'answers':14} {model.policy.who_answers}{up_to}{'  (new)' * sets_answer}")
+    who, ages = model.policy.who_answers, written_ages([*model.policy.expert_ages])
+    print(f"{'answers':14} {who}{f': the expert at ages {ages}' * (who == 'both')}{'  (new)' * sets_answer}")
     if args.output is not None:
         keep_normalization(args.agent, args.output)
         model.save(args.output, compact=args.compact)

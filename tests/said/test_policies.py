@@ -400,7 +400,7 @@ def test_of_both_the_expert_answers_young_observations_and_the_planner_old_ones(
     obs = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     np.testing.assert_array_equal(obs["delay"][:, 0], [0, 1, 1, 1, 1, 1, 1, 0, 1, 2, 2, 2, 2, 2])
     young = np.array([0, 0, 1, 1, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0], bool)  # and not s_0
-    assert model.policy.expert_up_to is None
+    assert not model.policy.expert_ages
     answers = {}
     for who in ("planner", "expert"):
         with model.policy.answering(who):
@@ -420,6 +420,12 @@ def test_of_both_the_expert_answers_young_observations_and_the_planner_old_ones(
     set_random_seed(0)
     np.testing.assert_array_equal(answer(model, obs, deterministic=False), first)
     assert not np.array_equal(first, expected)
+    # The other way round the expert has the oldest ages, and begins
+    model.set_answer("both", expert_from=2)
+    old = np.array([1, 1, 0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1], bool)
+    np.testing.assert_array_equal(
+        answer(model, obs), np.where(old[:, None], answers["expert"][0], answers["planner"][0])
+    )
 
 
 @pytest.mark.parametrize("how", [{"temperature": 0.0}, {"temperature": 1.0, "choice_factor": 1.0}])
@@ -467,10 +473,13 @@ def test_no_actor_that_has_not_learned_decides():
 def test_both_need_an_age_and_keep_what_each_has_met(saved, tmp_path):
     model = SAID.load(saved, device="cpu")
     max_delay = model.policy.max_delay
-    for wrong in (None, -1, max_delay):
-        with pytest.raises(ValueError, match="expert_up_to"):
-            model.set_answer("both", expert_up_to=wrong)
-    with pytest.raises(ValueError, match="needs set_answer"):
+    for wrong in ({}, {"expert_up_to": -1}, {"expert_up_to": max_delay}, {"expert_from": 0}):
+        with pytest.raises(ValueError, match=r"expert_up_to is .* expected one of them"):
+            model.set_answer("both", **wrong)
+    for wrong in ({"expert_from": max_delay + 1}, {"expert_up_to": 0, "expert_from": 1}):
+        with pytest.raises(ValueError, match=r"expert_from \d, expected one of them"):
+            model.set_answer("both", **wrong)
+    with pytest.raises(ValueError, match="expert_up_to=1 needs set_answer"):
         model.set_answer("planner", expert_up_to=1)
     with pytest.raises(ValueError, match="Up to which age"), model.policy.answering("both"):
         pass
@@ -479,7 +488,7 @@ def test_both_need_an_age_and_keep_what_each_has_met(saved, tmp_path):
         model.set_answer("both", expert_up_to=up_to)
         model.save(tmp_path / "agent.zip")
         loaded = SAID.load(tmp_path / "agent.zip", device="cpu")
-        assert loaded.policy.expert_up_to == up_to and loaded.policy.who_answers == "both"
+        assert loaded.policy.expert_ages == range(up_to + 1) and loaded.policy.who_answers == "both"
         with pytest.warns(UserWarning, match="has not met"):
             model.check_ages([up_to, max_delay])
     with warnings.catch_warnings():

@@ -150,11 +150,16 @@ def test_a_trial_can_be_stopped_and_the_planner_stays_trained(monkeypatch):
 @given(st.lists(st.tuples(*[st.integers(-50, 50)] * 2, st.integers(0, 6)), min_size=1, max_size=8))
 def test_the_best_share_is_that_of_all(rows):
     planner, expert, ages = np.array(rows, float).T
-    mean, up_to = trial.best_share(planner, expert, ages)
-    every = [np.where(ages <= cut, expert, planner).mean() for cut in range(-1, 7)]
+    mean, cut, is_below = trial.best_share(planner, expert, ages)
+    every = [
+        np.where((ages <= age) == below, expert, planner).mean() for age in range(-1, 7) for below in (True, False)
+    ]
     assert mean == pytest.approx(max(every))
-    assert np.where(ages <= up_to, expert, planner).mean() == pytest.approx(mean)
-    assert np.isinf(up_to) == (expert.mean() > max(every[: int(ages.max()) + 1]) + 1e-12)
+    assert np.where((ages <= cut) == is_below, expert, planner).mean() == pytest.approx(mean)
+    apart = [(age, below) for age in range(int(ages.min()), int(ages.max())) for below in (True, False)]
+    others = [np.where((ages <= age) == below, expert, planner) for age, below in apart]
+    best_alone = max(planner.mean(), max((x.mean() for x in others), default=-np.inf))
+    assert np.isinf(cut) == (expert.mean() > best_alone + 1e-12)
 
 
 def test_both_answer_only_where_that_gains_more_than_its_error():
@@ -171,23 +176,25 @@ def test_a_share_by_chance_is_none(monkeypatch):
     """At one age of two the expert is better, by so little that four episodes do not tell."""
     returns = {"planner": np.array([4.0, 9.0, 4.0, 9.0]), "expert": np.array([4.1, 1.0, 3.95, 1.0])}
     found = trial.Trial(returns, np.array([0.0, 2.0, 0.0, 2.0]), 7)
-    assert trial.best_share(*returns.values(), found.ages)[1] == 1.0
+    assert trial.best_share(*returns.values(), found.ages)[1:] == (1.0, True)
     monkeypatch.setattr(trial, "play_trial", lambda *_: found)
     model = make(env=pendulum(delay=(0, 2)), planner_trial_episodes=2).learn(60)
     assert model.policy.who_answers == "planner"
 
 
-def test_both_answer_where_each_does_better(monkeypatch, tmp_path):
+@pytest.mark.parametrize(("age", "expert_ages"), [(2.0, range(2)), (0.0, range(2, 3))])
+def test_both_answer_where_each_does_better(age, expert_ages, monkeypatch, tmp_path):
+    """The planner is better at an age, the expert at the other."""
     returns = {"planner": np.array([5.0, 1.0, 5.1, 1.1]), "expert": np.array([1.0, 3.0, 1.1, 3.1])}
-    found = trial.Trial(returns, np.array([2.0, 0.0, 2.0, 0.0]), 7)
+    found = trial.Trial(returns, np.array([age, 2.0 - age, age, 2.0 - age]), 7)
     monkeypatch.setattr(trial, "play_trial", lambda *_: found)
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message="The planner is worse than its expert")
         model = make(env=pendulum(delay=(0, 2)), planner_trial_episodes=2).learn(60)
-    assert model.policy.who_answers == "both" and model.policy.expert_up_to == 1
+    assert model.policy.who_answers == "both" and model.policy.expert_ages == expert_ages
     model.save(tmp_path / "agent.zip")
     loaded = SAID.load(tmp_path / "agent.zip", device="cpu")
-    assert loaded.policy.who_answers == "both" and loaded.policy.expert_up_to == 1
+    assert loaded.policy.who_answers == "both" and loaded.policy.expert_ages == expert_ages
     assert loaded.policy.answers == ["planner", "expert", "both"]
 
 
@@ -280,5 +287,5 @@ def test_returns_and_steps_are_logged_behind_the_planners_rows(monkeypatch, tmp_
     model.train_planner()
     rows = list(csv.DictReader((tmp_path / "progress.csv").open()))
     assert [float(rows[-1][f"trial/{key}"]) for key in ("planner_return", "expert_return", "steps")] == [2.0, 1.0, 7.0]
-    assert float(rows[-1]["trial/expert_up_to"]) == -1.0
+    assert (float(rows[-1]["trial/expert_from"]), float(rows[-1]["trial/expert_up_to"])) == (0.0, -1.0)
     assert model.logger.name_to_value["mine"] == 7  # for the user's next row

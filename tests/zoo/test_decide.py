@@ -76,12 +76,12 @@ def test_an_agent_decides_otherwise_and_is_else_the_same(
 def test_who_answers_is_set_and_shown(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     new = tmp_path / "both.zip"
     decide.main([str(run), "--answer", "both", "--expert-up-to", "0", "-o", str(new)])
-    assert "answers        both: the expert up to age 0  (new)" in capsys.readouterr().out
-    assert load(new).policy.who_answers == "both" and load(new).policy.expert_up_to == 0
+    assert "answers        both: the expert at ages 0  (new)" in capsys.readouterr().out
+    assert load(new).policy.who_answers == "both" and load(new).policy.expert_ages == range(1)
     assert list(results(new, tmp_path)) == ["planner", "expert", "both"]
     newer = tmp_path / "newer.zip"
     decide.main([str(new), "--expert-up-to", "1", "-o", str(newer)])  # both answer already
-    assert load(newer).policy.expert_up_to == 1
+    assert load(newer).policy.expert_ages == range(2)
 
 
 def test_statistics_of_normalised_observations_go_with_the_file(run: Path, tmp_path: Path) -> None:
@@ -106,7 +106,7 @@ def test_without_settings_it_shows_them(run: Path, capsys: pytest.CaptureFixture
         (["{run}", "-o", "x.zip"], "none is given: add --temperature"),
         (["{run}", "--temperature", "-1", "-o", "x.zip"], "temperature is -1.0, expected at least 0"),
         (["{run}", "--scored-states", "some", "-o", "x.zip"], "expected one of ('future', 'decision', 'all')"),
-        (["{run}", "--answer", "both", "-o", "x.zip"], "expert_up_to is None, expected an age in 0..1"),
+        (["{run}", "--answer", "both", "-o", "x.zip"], "expert_up_to is None and expert_from None, expected one of"),
         (["{run}", "--expert-up-to", "1"], "-o is missing"),
         (["{run}", "--expert-up-to", "1", "-o", "x.zip"], "needs set_answer('both')"),
         (["{run}", "--choice-factor", "best", "-o", "x.zip"], "invalid"),
