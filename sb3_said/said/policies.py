@@ -159,25 +159,24 @@ class SAIDPolicy(DelayedSACPolicy):
         :raises ValueError: for another name, for a planner that is not trained, for no student, or for ages that leave
             one of both without any
         """
-        part = float(who == "expert")
-        given = {name: age for name, age in (("up_to", expert_up_to), ("from", expert_from)) if age is not None}
+        n_ages, part = self.max_delay + 1, float(who == "expert")
         if who == "both":
-            n_ages = self.max_delay + 1
-            n = (
-                -(n_ages - expert_from)
-                if expert_from is not None
-                else 1 + (-1 if expert_up_to is None else expert_up_to)
-            )
-            if len(given) != 1 or not 0 < abs(n) < n_ages:
+            n = 0  # of the expert's ages; those of the oldest are written as less than 0
+            if expert_up_to is not None and expert_from is None and 0 <= expert_up_to < self.max_delay:
+                n = expert_up_to + 1
+            elif expert_from is not None and expert_up_to is None and 0 < expert_from <= self.max_delay:
+                n = expert_from - n_ages
+            if n == 0:
                 raise ValueError(
                     f"expert_up_to is {expert_up_to} and expert_from {expert_from}, expected one of them: the expert "
                     f"answers up to an age in 0..{self.max_delay - 1}, or from one in 1..{self.max_delay} on, and the "
                     "planner at the others."
                 )
             part = n / n_ages
-        elif given:
-            name, age = next(iter(given.items()))
-            raise ValueError(f"expert_{name}={age} needs set_answer('both'), got {who!r}.")
+        elif (expert_up_to, expert_from) != (None, None):
+            raise ValueError(
+                f"expert_up_to={expert_up_to} and expert_from={expert_from} need set_answer('both'), got {who!r}."
+            )
         self._check_answer("planner" if who == "both" else who)
         self.expert_preferred.fill_(part)
         if self.student is not None:

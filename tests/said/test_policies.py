@@ -473,13 +473,15 @@ def test_no_actor_that_has_not_learned_decides():
 def test_both_need_an_age_and_keep_what_each_has_met(saved, tmp_path):
     model = SAID.load(saved, device="cpu")
     max_delay = model.policy.max_delay
-    for wrong in ({}, {"expert_up_to": -1}, {"expert_up_to": max_delay}, {"expert_from": 0}):
-        with pytest.raises(ValueError, match=r"expert_up_to is .* expected one of them"):
-            model.set_answer("both", **wrong)
-    for wrong in ({"expert_from": max_delay + 1}, {"expert_up_to": 0, "expert_from": 1}):
-        with pytest.raises(ValueError, match=r"expert_from \d, expected one of them"):
-            model.set_answer("both", **wrong)
-    with pytest.raises(ValueError, match="expert_up_to=1 needs set_answer"):
+    wrong = [{}, {"expert_up_to": 0, "expert_from": 1}]
+    wrong += [{"expert_up_to": age} for age in (-2, -1, max_delay, max_delay + 2)]
+    wrong += [{"expert_from": age} for age in (-1, 0, max_delay + 1, max_delay + 2)]
+    for ages in wrong:
+        with pytest.raises(ValueError, match=r"expert_up_to is .* and expert_from .* expected one of them"):
+            model.set_answer("both", **ages)
+    with pytest.raises(
+        ValueError, match=r"expert_up_to=1 and expert_from=None need set_answer\('both'\), got 'planner'"
+    ):
         model.set_answer("planner", expert_up_to=1)
     with pytest.raises(ValueError, match="Up to which age"), model.policy.answering("both"):
         pass

@@ -108,7 +108,7 @@ def test_without_settings_it_shows_them(run: Path, capsys: pytest.CaptureFixture
         (["{run}", "--scored-states", "some", "-o", "x.zip"], "expected one of ('future', 'decision', 'all')"),
         (["{run}", "--answer", "both", "-o", "x.zip"], "expert_up_to is None and expert_from None, expected one of"),
         (["{run}", "--expert-up-to", "1"], "-o is missing"),
-        (["{run}", "--expert-up-to", "1", "-o", "x.zip"], "needs set_answer('both')"),
+        (["{run}", "--expert-up-to", "1", "-o", "x.zip"], "need set_answer('both')"),
         (["{run}", "--choice-factor", "best", "-o", "x.zip"], "invalid"),
         (["{sadr}"], "is a run of 'sadr', which has no planner"),
         (["{sadr_zip}"], "SAID"),
