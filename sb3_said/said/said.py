@@ -282,9 +282,9 @@ class SAID(OfflineAlgorithm, StableSAC):
         :param gradient_steps: ``planner_gradient_steps`` by default
         :raises ValueError: when the buffer is empty, as it is after ``load``
         """
-        newest, env = self.planner_newest_fraction, self._vec_normalize_env
-        source = self.replay_buffer.window_source(newest, env)
-        has_older = len(source) < self.replay_buffer.size() * self.n_envs
+        replay, newest, env = self.replay_buffer, self.planner_newest_fraction, self._vec_normalize_env
+        source = replay.window_source(newest, env)
+        has_older = len(source) < replay.size() * replay.n_envs  # a log's replay has one, whatever the agent has
         bootstrap = self._stored_values if self._n_updates > 0 else None  # offline there are no critics
         values = returns_to_go(source, self.gamma, self.planner_terminal_penalty, bootstrap)
         return PlannerTrainer(
@@ -293,7 +293,7 @@ class SAID(OfflineAlgorithm, StableSAC):
             self.planner_gradient_steps if gradient_steps is None else gradient_steps,
             held_out=HELD_OUT if len(source) > 1 else 0.0,
             seed=self.seed or 0,
-            older=self.replay_buffer.window_source(newest, env, older=True) if has_older else None,
+            older=replay.window_source(newest, env, older=True) if has_older else None,
         )
 
     @th.no_grad()
