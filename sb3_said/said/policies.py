@@ -136,7 +136,7 @@ class SAIDPolicy(DelayedSACPolicy):
     def answers(self) -> list[Answer]:
         """Who can answer ``predict``."""
         can = {"planner": self.planner_is_trained, "expert": True, "student": self.student is not None}
-        can["both"] = self.planner_is_trained and 0 < len(self.expert_ages) <= self.max_delay
+        can["both"] = self.planner_is_trained and self._ages_are_shared
         return [who for who in get_args(Answer) if can[who]]
 
     @property
@@ -145,6 +145,10 @@ class SAIDPolicy(DelayedSACPolicy):
         n_ages = self.max_delay + 1
         n = round(float(self.expert_preferred) * n_ages)
         return range(n) if n >= 0 else range(n_ages + n, n_ages)
+
+    @property
+    def _ages_are_shared(self) -> bool:
+        return 0 < len(self.expert_ages) <= self.max_delay
 
     def set_answer(self, who: Answer, expert_up_to: int | None = None, expert_from: int | None = None) -> None:
         """Let one of them answer ``predict`` from now on, or two; a file keeps it.
@@ -218,7 +222,7 @@ class SAIDPolicy(DelayedSACPolicy):
     def _check_answer(self, who: Answer) -> None:
         if who not in get_args(Answer):
             raise ValueError(f"Only the 'planner', the 'expert', 'both' or a 'student' can answer, got {who!r}.")
-        if who == "both" and not 0 < len(self.expert_ages) <= self.max_delay:
+        if who == "both" and not self._ages_are_shared:
             raise ValueError(
                 "Up to which age is the expert to answer? Call set_answer('both', expert_up_to=...) first."
             )

@@ -89,6 +89,8 @@ def test_a_planner_that_has_learned_nothing_decides_as_its_guess(trainer: Planne
 def test_what_the_guess_is_sure_of_is_hardly_moved():
     planner = make_planner(first_guess="prior")
     planner.prior.slope.fill_(1.0)
+    for parameter in planner.first_guess.model.parameters():
+        parameter.zero_()  # nothing moves: an untrained model ends far away, where the network is as large
     observation, history = th.randn(4, OBS, generator=seeded()), th.rand(4, DELAY, ACT, generator=seeded(1))
     delay = th.full((4,), DELAY)
     plans = {}
@@ -101,7 +103,7 @@ def test_what_the_guess_is_sure_of_is_hardly_moved():
     off = {
         std: ((plan.present - guess.present) / planner.normalizer.state_std).abs().mean() for std, plan in plans.items()
     }
-    assert 0 < off[LEAST_STD] < 0.25 * off[1.0]  # of an untrained network, whose moves are large
+    assert 0 < off[LEAST_STD] < 0.1 * off[1.0]
 
 
 @pytest.mark.parametrize("prediction", ["v", "epsilon"])
