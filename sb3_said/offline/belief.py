@@ -118,7 +118,7 @@ class RolledOutModel(LearnedBelief):
         return z * self.std + self.mean
 
     def loss(self, windows: Windows, generator: th.Generator) -> th.Tensor:
-        """Return the error of one step, in units of moves; a window gives its first."""
+        """Return the model's loss of one step; a window gives its first."""
         return self.model.loss(self._z(windows.states[:, :2]), windows.actions[:, 0], windows.valid[:, 1])
 
 

@@ -13,6 +13,9 @@ def plain_network(n_in: int, n_out: int, hidden: int) -> nn.Sequential:
     )
 
 
+RIGHT = 1e-4  # squared error, in moves, below which an entry counts as known: a hundredth of its move
+
+
 class ResidualBlock(nn.Module):
     """Two layers whose answer is added to what they read, normalised before (as in transformers, and in SimbaV1)."""
 
@@ -55,12 +58,15 @@ class OneStepModel(nn.Module):
         return state + self.move_std * self.net(th.cat([state, action], dim=-1))
 
     def loss(self, states: th.Tensor, actions: th.Tensor, follows: th.Tensor) -> th.Tensor:
-        """Return the mean squared error of one step, in moves.
+        """Return the mean over entries of log(1 + e / RIGHT), e an entry's mean squared error of one step, in moves.
+
+        That is the likelihood of entries that are off by a variance of their own, which the batch tells. A plain mean
+        would be about what cannot be foreseen: 78 of Ant-v5's 105 entries are contact forces.
 
         :param states: (B, 2, obs_dim), one after the other
         :param actions: (B, act_dim), between them
         :param follows: (B,) bool, whether the second state is of the same episode
         """
         now, then = states.unbind(1)
-        error = (((self(now, actions) - then) / self.move_std) ** 2).mean(-1)  # (B,)
-        return (error * follows).sum() / follows.sum().clamp(min=1)
+        error = ((self(now, actions) - then) / self.move_std) ** 2 * follows[:, None]  # (B, obs_dim)
+        return (error.sum(0) / follows.sum().clamp(min=1) / RIGHT).log1p().mean()

@@ -1,10 +1,13 @@
-"""The model of one step: in units of moves, and blind to what is behind an episode's end."""
+"""The model of one step: in units of moves, each entry for itself, and blind to what is behind an episode's end."""
 
 from __future__ import annotations
 
+import math
+
+import pytest
 import torch as th
 
-from sb3_said.planner.plain import OneStepModel
+from sb3_said.planner.plain import RIGHT, OneStepModel
 
 OBS_DIM, ACT_DIM = 3, 2
 
@@ -22,14 +25,34 @@ def test_its_loss_is_in_moves_over_the_steps_that_follow():
     states = th.randn(6, 2, OBS_DIM, generator=generator)
     actions = th.rand(6, ACT_DIM, generator=generator)
     follows = th.tensor([True, False, True, True, False, True])
-    expected = [
-        ((model(states[i, :1], actions[i : i + 1]) - states[i, 1:]) / model.move_std).square().mean()
-        for i in (0, 2, 3, 5)
-    ]
-    th.testing.assert_close(model.loss(states, actions, follows), th.stack(expected).mean())
+    expected = 0.0
+    for entry in range(OBS_DIM):
+        errors = [
+            ((model(states[i, :1], actions[i : i + 1]) - states[i, 1:]) / model.move_std)[0, entry].item() ** 2
+            for i in (0, 2, 3, 5)
+        ]
+        expected += math.log(1 + sum(errors) / 4 / RIGHT) / OBS_DIM
+    assert model.loss(states, actions, follows).item() == pytest.approx(expected, rel=1e-5)
     states[~follows] = 1e6
-    th.testing.assert_close(model.loss(states, actions, follows), th.stack(expected).mean())
+    assert model.loss(states, actions, follows).item() == pytest.approx(expected, rel=1e-5)
     assert model.loss(states, actions, ~follows & follows) == 0  # none follows: nothing is divided by zero
+
+
+def test_what_cannot_be_foreseen_does_not_hide_what_can():
+    """However loud the noise of an entry, what the hidden layers learn from it is as much, and from the others, too."""
+    generator = th.Generator().manual_seed(0)
+    states = th.randn(64, 2, OBS_DIM, generator=generator)
+    actions = th.rand(64, ACT_DIM, generator=generator)
+    gradients = []
+    for loudness in (1.0, 1000.0):
+        model = make_model()
+        louder = states.clone()
+        louder[:, 1, 2] *= loudness
+        model.loss(louder, actions, th.ones(64, dtype=th.bool)).backward()
+        last = model.net[-1]
+        gradients.append((last.weight.grad, model.net[0].weight.grad.norm().item()))
+    th.testing.assert_close(gradients[0][0][:2], gradients[1][0][:2])
+    assert gradients[1][1] < 2 * gradients[0][1]
 
 
 @th.no_grad()
