@@ -84,7 +84,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         learning_rate: float | Schedule = 3e-4,
         *,
         planner_kwargs: dict[str, Any] | None = None,
-        planner_gradient_steps: int = 25_000,
+        planner_gradient_steps: int = 4_000,
         planner_train_freq: int | None = None,
         planner_newest_fraction: float = 0.2,
         planner_terminal_penalty: float | None = None,

@@ -55,7 +55,7 @@ def test_the_default_preset_and_the_constructor_make_the_same_agent(env_id: str,
     assert {n: getattr(model, n) for n in names} == {n: getattr(plain, n) for n in names}
     assert model.lr_schedule(1.0) == plain.lr_schedule(1.0)
     # The numbers that the results stand on.
-    assert (model.learning_starts, model.planner_gradient_steps, model.planner_newest_fraction) == (10_000, 25_000, 0.2)
+    assert (model.learning_starts, model.planner_gradient_steps, model.planner_newest_fraction) == (10_000, 4_000, 0.2)
     assert (model.policy.planner.config.d_model, model.policy.planner.config.scored_states) == (128, "decision")
 
 

@@ -1,0 +1,148 @@
+"""Agents that learned online, over delays and training seeds: a table and a plot beside the paper's Table 1.
+
+    python benchmarks/online_table.py results/agents/hopper.json results/agents/walker2d.json \\
+        results/agents/walker2d_seed2.json --plot agents.png
+
+Each file is of sb3-said over-delays. Agents of one task, told apart by their file's SHA-256, are training seeds.
+
+SAID       both, each at its ages, where an agent's file shares them between planner and expert; else the planner
+intervals  95 %, by a bootstrap that draws training seeds, then episodes of each; of one seed over its episodes
+seeds      their own means over fixed delays, in the order of the files
+falls      part of all episodes that the task ended
+change     of the actions, from step to step
+paper      what Table 1 of arXiv 2603.01553 has for SAID, mean and standard error: an agent for each delay, 5 M steps
+plot       thin lines are training seeds
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from sb3_said.evaluation import confidence_interval, plots, stratified_interval, worst_tenth
+from sb3_said.zoo.cells import Cell, Results
+
+#: Rows of Table 1 at delays 0, 4, 8 and 16.
+PAPER = {
+    "Hopper-v5": ((3170, 283), (2698, 305), (2514, 415), (3268, 237)),
+    "Walker2d-v5": ((5158, 360), (4874, 230), (5222, 295), (4913, 175)),
+    "HalfCheetah-v5": ((14845, 367), (9648, 436), (5565, 274), (5289, 432)),
+    "Ant-v5": ((5953, 84), (4586, 660), (4610, 383), (4137, 41)),
+}
+PAPER_DELAYS = (0, 4, 8, 16)
+SAID, EXPERT = "SAID", "its expert"
+Seeds = list[dict[int | str, Cell]]  # for each training seed its cell by delay
+
+
+def read(paths: Iterable[Path]) -> dict[str, dict[str, Seeds]]:
+    """Return by task and row what each training seed played.
+
+    :raises ValueError: for files of other episodes, or a seed that has no row of SAID
+    """
+    found: dict[str, dict[str, Seeds]] = {}
+    episodes: dict[str, dict[str, object]] = {}
+    for path in paths:
+        results = Results(path)
+        env = str(results.settings["env"])
+        if episodes.setdefault(env, results.settings) != results.settings:
+            raise ValueError(f"{path} has {results.settings}, and another file of the task {episodes[env]}.")
+        cells = [cell for cell in results.cells if cell.result is not None and not cell.age_error]
+        for agent in dict.fromkeys(cell.sha256 for cell in cells):
+            of_agent = [cell for cell in cells if cell.sha256 == agent]
+            own = "both" if any(cell.answer == "both" for cell in of_agent) else "planner"
+            for row, answer in ((SAID, own), (EXPERT, "expert")):
+                by_delay = {cell.delay: cell for cell in of_agent if cell.answer == answer}
+                if not by_delay:
+                    raise ValueError(f"{path} has no episodes of {answer}, who is to be the row {row!r}.")
+                found.setdefault(env, {}).setdefault(row, []).append(by_delay)
+    return found
+
+
+def returns_over(seeds: Seeds, delays: Iterable[int | str]) -> np.ndarray:
+    """Return each episode's return, in the mean over delays, of the seeds that have played them all: (n_seeds, n)."""
+    delays = list(delays)
+    whole = [of_seed for of_seed in seeds if set(delays) <= set(of_seed)]
+    return np.array([np.mean([_returns(of_seed[delay]) for delay in delays], axis=0) for of_seed in whole])
+
+
+def _returns(cell: Cell) -> np.ndarray:
+    assert cell.result is not None  # as `read` has seen to
+    return np.array(cell.result["returns"])
+
+
+def written(returns: np.ndarray) -> str:
+    """Write the mean of (n_seeds, n_episodes) with its interval."""
+    if not len(returns):
+        return "-"
+    interval = confidence_interval(returns[0]) if len(returns) == 1 else stratified_interval(returns)
+    return f"{interval.value:,.0f} [{interval.low:,.0f}, {interval.high:,.0f}]"
+
+
+def show(found: Mapping[str, Mapping[str, Seeds]]) -> None:
+    """Print a Markdown table: SAID, its expert and the paper's SAID for each task."""
+    delays = list(dict.fromkeys(d for rows in found.values() for seeds in rows.values() for one in seeds for d in one))
+    fixed, random = ([d for d in delays if isinstance(d, kind)] for kind in (int, str))
+    columns = [*map(str, delays), "mean of fixed", "seeds", "mean of random", "worst tenth", "falls", "change"]
+    print(f"| task | agent | {' | '.join(columns)} |\n|---|---|{'---|' * len(columns)}")
+    for env, rows in found.items():
+        for row, seeds in rows.items():
+            played = [cell.result for of_seed in seeds for cell in of_seed.values() if cell.result is not None]
+            all_returns = np.concatenate([result["returns"] for result in played])
+            cells = [written(returns_over(seeds, [delay])) for delay in delays]
+            cells += [written(returns_over(seeds, fixed))]
+            cells += [", ".join(f"{mean:,.0f}" for mean in returns_over(seeds, fixed).mean(1))]
+            cells += [written(returns_over(seeds, random)) if random else "-", f"{worst_tenth(all_returns):,.0f}"]
+            cells += [f"{sum(result['terminations'] for result in played) / len(all_returns):.1%}"]
+            cells += [f"{np.mean([result['mean_action_change']['value'] for result in played]):.3f}"]
+            print(f"| {env} | {row} | {' | '.join(cells)} |")
+        paper = dict(zip(PAPER_DELAYS, PAPER.get(env, ()), strict=False))
+        cells = [f"{paper[d][0]:,} ± {paper[d][1]}" if d in paper else "" for d in delays]
+        if paper:
+            print(f"| {env} | SAID, paper | {' | '.join(cells)} |{' |' * (len(columns) - len(cells))}")
+
+
+def plot(found: Mapping[str, Mapping[str, Seeds]], path: Path) -> None:
+    """Draw a panel for each task: return over fixed delays, each training seed thin and their mean thick."""
+    axes = plots.panels(len(found), width=4.6, height=3.2)
+    for ax, (env, rows) in zip(axes, found.items(), strict=True):
+        for (row, seeds), color, marker in zip(rows.items(), plots.COLORS, plots.MARKERS, strict=False):
+            fixed = sorted({d for of_seed in seeds for d in of_seed if isinstance(d, int)})
+            of_seeds = np.array([[_returns(of_seed[d]).mean() for d in fixed] for of_seed in seeds])
+            ax.plot(fixed, of_seeds.T, color=color, alpha=0.45, linewidth=0.8)
+            ax.plot(fixed, of_seeds.mean(0), color=color, marker=marker, linewidth=2, label=f"{row}, delays 0 to 16")
+        if env in PAPER:
+            mean, error = np.array(PAPER[env]).T
+            ax.errorbar(PAPER_DELAYS, mean, error, color="grey", linestyle="none", marker="x", capsize=3,
+                        label="SAID, paper: an agent for each delay, 5 M steps")  # fmt: skip
+        n_seeds = len(rows[SAID])
+        ax.set_title(f"{env}, {n_seeds} training seed{'s' if n_seeds > 1 else ''}", fontsize="medium")
+        ax.set_xticks(PAPER_DELAYS)
+        ax.set_ylim(bottom=0)
+        ax.set_xlabel("delay (control steps)")
+        ax.set_ylabel("return of an episode")
+    handles, labels = axes[0].get_legend_handles_labels()
+    axes[0].figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
+    plots.save(axes[0], path)
+
+
+def main(argv: list[str] | None = None) -> dict[str, dict[str, Seeds]]:
+    """Print the table, draw the plot, and return what was read."""
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("files", nargs="+", type=Path, metavar="JSON")
+    p.add_argument("--plot", type=Path, metavar="PNG", help="draw return over fixed delays, a panel for each task")
+    args = p.parse_args(argv)
+    try:
+        found = read(args.files)
+    except ValueError as error:
+        p.error(str(error))
+    show(found)
+    if args.plot:
+        plot(found, args.plot)
+    return found
+
+
+if __name__ == "__main__":
+    main()
