@@ -51,8 +51,7 @@ class PlannerConfig:
     # What plain networks make of what is known: the states since by a model of one step, and a clone's action. "prior":
     # the network predicts what this guess does not, so that a planner begins as good as it (measured on logs and on an
     # expert's replay, results/nine_logs.md and results/what_diffusion_buys.md). "plain": the guess of a weaker model is
-    # shown to the network, and no more; files saved before there was a choice have True for it, and False for "none",
-    # which is the paper's
+    # shown to the network, and no more. "none" is the paper's
     first_guess: str = "prior"
     # Diffusion
     prediction: str = "v"  # measured: safe with few steps; or "epsilon" (paper)
@@ -116,9 +115,6 @@ class PlannerConfig:
     precision: str = "auto"  # bfloat16 autocast where the hardware has it; or "float32", "bfloat16"
 
     def __post_init__(self) -> None:
-        if isinstance(self.first_guess, bool):
-            object.__setattr__(self, "first_guess", "plain" if self.first_guess else "none")
-            object.__setattr__(self, "present", self.present or "inpainted")
         for field in fields(self):
             _check_setting(field.name, getattr(self, field.name), field.default)
         self._settle_present()

@@ -28,12 +28,6 @@ def test_settings_of_sampling_do_not_decide_the_weights():
     assert dataclasses.replace(config, depth=4).weight_settings() != config.weight_settings()
 
 
-def test_files_from_before_there_was_a_choice_of_the_first_guess_are_read():
-    read = [PlannerConfig(first_guess=saved) for saved in (True, False)]
-    assert [config.first_guess for config in read] == ["plain", "none"]
-    assert [config.present for config in read] == ["inpainted"] * 2  # which was all there was
-
-
 def test_a_plan_begins_at_the_guessed_present_where_there_is_one():
     assert PlannerConfig().present == PlannerConfig(mask="none").present == "guessed"
     assert PlannerConfig(first_guess="none").present == PlannerConfig(mask="fixed").present == "inpainted"
