@@ -59,6 +59,10 @@ def own_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--seed", type=int, help="of everything drawn; part of the folder's name (default: drawn)")
     parser.add_argument(
+        "--num-threads", type=int, metavar="N", help="torch threads; two are a quarter faster on an idle machine, and "
+        "thirty times slower beside one other process; -1 leaves it to torch (default: 1)",
+    )  # fmt: skip
+    parser.add_argument(
         "--checkpoint-freq", type=int, metavar="N", help="steps between checkpoints (default: by time, every ten "
         "minutes, and less often the larger the replay is)",
     )  # fmt: skip
@@ -102,6 +106,8 @@ def read_command_line(argv: list[str]) -> tuple[Run, str, list[str]]:
     """
     options, zoo_argv = own_parser().parse_known_args(argv)
     zoo_argv = [*joined_settings(zoo_argv), *(["--help"] if options.help else [])]
+    if options.num_threads is not None or options.resume is None:  # whose own number stands before
+        zoo_argv.append(f"--num-threads={options.num_threads or 1}")
     delay, expert_delay = read_delay(options.delay), read_delay(options.expert_delay)
     if options.resume is not None:
         record = Record.read(options.resume)

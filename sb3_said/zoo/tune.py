@@ -34,8 +34,7 @@ examples:
   sb3-said tune logs/said/Hopper-v5-delay4-seed1_1
 
   # two workers; they may run on machines that share the folder
-  sb3-said tune logs/said/Hopper-v5-delay4-seed1_1 --num-threads 1 & \\
-  sb3-said tune logs/said/Hopper-v5-delay4-seed1_1 --num-threads 1
+  sb3-said tune logs/said/Hopper-v5-delay4-seed1_1 & sb3-said tune logs/said/Hopper-v5-delay4-seed1_1
 
   # a quick look: one depth, fewer updates, fewer episodes, in a folder of its own
   sb3-said tune logs/said/Hopper-v5-delay4-seed1_1 --depths 2 --gradient-steps 5000 --episodes 10 --output look
@@ -86,13 +85,13 @@ def main(argv: list[str] | None = None) -> None:
     add("--output", type=Path, metavar="DIR", help="default: RUN_DIR/tune")
     add("--timeout", type=float, default=math.inf, metavar="SECONDS", help="begin no trial after this time")
     add("--device", default="auto", help="torch device (default: auto)")
-    add("--num-threads", type=int, help="torch threads (default: torch's own choice)")
+    add("--num-threads", type=int, default=1, help="torch threads, which wait for each other beside another process "
+        "(default: 1)")  # fmt: skip
     add("-P", "--progress", action="store_true", help="show a progress bar while a planner trains")
     args = parser.parse_args(argv)
-    if args.num_threads is not None:
-        th.set_num_threads(args.num_threads)
     with explained(parser):
         check(args)
+        th.set_num_threads(args.num_threads)
         tune(args)
 
 
@@ -101,7 +100,7 @@ def check(args: argparse.Namespace) -> None:
 
     :raises ValueError: naming the option that is wrong
     """
-    check_positive(args, "episodes", "round", "report_episodes", "n_trials", "gradient_steps")
+    check_positive(args, "episodes", "round", "report_episodes", "n_trials", "gradient_steps", "num_threads")
     if not 0 <= args.prune < 1:
         raise ValueError(f"--prune is a p-value in [0, 1), got {args.prune}; 0 prunes nothing.")
     for name in ("depths", "temperatures", "sampling_steps", "choice_factors"):

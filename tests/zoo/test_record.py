@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
 import shutil
@@ -134,6 +135,16 @@ def test_text_that_rl_zoo3_would_evaluate_is_refused(run: Path, capsys: pytest.C
             train.main(["--resume", str(run), "--verbose", "0"])
         shown = capsys.readouterr()
         assert f"{kind} is text" in shown.err and "evil" not in shown.out
+
+
+def test_a_resume_keeps_the_number_of_threads_unless_told(run: Path) -> None:
+    options = json.loads((run / "run.json").read_text())["options"]
+    forge(run, options={**options, "num_threads": 2})
+    parser = argparse.ArgumentParser(allow_abbrev=False)
+    parser.add_argument("--num-threads", type=int)
+    for given, n_threads in ([], 2), (["--num-threads", "3"], 3):
+        words = train.read_command_line(["--resume", str(run), *given])[2]
+        assert parser.parse_known_args(words)[0].num_threads == n_threads
 
 
 @pytest.mark.parametrize("words", ["--delay 3", "--algo sadr", "--env Hopper-v5", "--env=Hopper-v5", "--preset paper"])

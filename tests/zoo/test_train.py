@@ -316,6 +316,14 @@ def test_the_default_preset_is_the_same_on_every_machine(monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize(
+    ("given", "n_threads"), [([], "1"), (["--num-threads", "3"], "3"), (["--num-threads=-1"], "-1")]
+)
+def test_training_takes_one_thread_unless_told(given: list[str], n_threads: str) -> None:
+    """Two wait for each other beside another process: 3 steps a second in place of 100 (results/settings.md)."""
+    assert f"--num-threads={n_threads}" in train.read_command_line(given)[2]
+
+
+@pytest.mark.parametrize(
     ("given", "read"),
     [
         ("-n 5 --eval-freq -1", "-n 5 --eval-freq -1"),
