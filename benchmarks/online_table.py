@@ -17,13 +17,13 @@ plot       thin lines are training seeds
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from sb3_said.evaluation import confidence_interval, plots, stratified_interval, worst_tenth
-from sb3_said.zoo.cells import Cell, Results
+from sb3_said.evaluation import confidence_interval, plots, stratified_interval
+from sb3_said.zoo.cells import Cell, Results, manners_of
 
 #: Rows of Table 1 at delays 0, 4, 8 and 16.
 PAPER = {
@@ -61,16 +61,10 @@ def read(paths: Iterable[Path]) -> dict[str, dict[str, Seeds]]:
     return found
 
 
-def returns_over(seeds: Seeds, delays: Iterable[int | str]) -> np.ndarray:
+def returns_over(seeds: Seeds, delays: Sequence[int | str]) -> np.ndarray:
     """Return each episode's return, in the mean over delays, of the seeds that have played them all: (n_seeds, n)."""
-    delays = list(delays)
-    whole = [of_seed for of_seed in seeds if set(delays) <= set(of_seed)]
-    return np.array([np.mean([_returns(of_seed[delay]) for delay in delays], axis=0) for of_seed in whole])
-
-
-def _returns(cell: Cell) -> np.ndarray:
-    assert cell.result is not None  # as `read` has seen to
-    return np.array(cell.result["returns"])
+    results = [[of_seed[d].result for d in delays] for of_seed in seeds if set(delays) <= set(of_seed)]
+    return np.array([np.mean([result["returns"] for result in of_seed if result], axis=0) for of_seed in results])
 
 
 def written(returns: np.ndarray) -> str:
@@ -89,14 +83,13 @@ def show(found: Mapping[str, Mapping[str, Seeds]]) -> None:
     print(f"| task | agent | {' | '.join(columns)} |\n|---|---|{'---|' * len(columns)}")
     for env, rows in found.items():
         for row, seeds in rows.items():
-            played = [cell.result for of_seed in seeds for cell in of_seed.values() if cell.result is not None]
-            all_returns = np.concatenate([result["returns"] for result in played])
+            of_fixed, manners = returns_over(seeds, fixed), manners_of(cell for one in seeds for cell in one.values())
+            assert manners is not None  # as `read` has seen to
             cells = [written(returns_over(seeds, [delay])) for delay in delays]
-            cells += [written(returns_over(seeds, fixed))]
-            cells += [", ".join(f"{mean:,.0f}" for mean in returns_over(seeds, fixed).mean(1))]
-            cells += [written(returns_over(seeds, random)) if random else "-", f"{worst_tenth(all_returns):,.0f}"]
-            cells += [f"{sum(result['terminations'] for result in played) / len(all_returns):.1%}"]
-            cells += [f"{np.mean([result['mean_action_change']['value'] for result in played]):.3f}"]
+            cells += [written(of_fixed), ", ".join(f"{of_seed.mean():,.0f}" for of_seed in of_fixed)]
+            cells += [written(returns_over(seeds, random)) if random else "-", f"{manners.worst_tenth:,.0f}"]
+            cells += ["-" if manners.ended is None else f"{manners.ended:.1%}"]
+            cells += ["-" if manners.change is None else f"{manners.change:.3f}"]
             print(f"| {env} | {row} | {' | '.join(cells)} |")
         paper = dict(zip(PAPER_DELAYS, PAPER.get(env, ()), strict=False))
         cells = [f"{paper[d][0]:,} ± {paper[d][1]}" if d in paper else "" for d in delays]
@@ -109,10 +102,10 @@ def plot(found: Mapping[str, Mapping[str, Seeds]], path: Path) -> None:
     axes = plots.panels(len(found), width=4.6, height=3.2)
     for ax, (env, rows) in zip(axes, found.items(), strict=True):
         for (row, seeds), color, marker in zip(rows.items(), plots.COLORS, plots.MARKERS, strict=False):
-            fixed = sorted({d for of_seed in seeds for d in of_seed if isinstance(d, int)})
-            of_seeds = np.array([[_returns(of_seed[d]).mean() for d in fixed] for of_seed in seeds])
-            ax.plot(fixed, of_seeds.T, color=color, alpha=0.45, linewidth=0.8)
-            ax.plot(fixed, of_seeds.mean(0), color=color, marker=marker, linewidth=2, label=f"{row}, delays 0 to 16")
+            fixed = sorted(d for d in set[int | str].intersection(*map(set, seeds)) if isinstance(d, int))
+            means = np.array([returns_over(seeds, [d]).mean(1) for d in fixed])  # (n_delays, n_seeds)
+            ax.plot(fixed, means, color=color, alpha=0.45, linewidth=0.8)
+            ax.plot(fixed, means.mean(1), color=color, marker=marker, linewidth=2, label=f"{row}, delays 0 to 16")
         if env in PAPER:
             mean, error = np.array(PAPER[env]).T
             ax.errorbar(PAPER_DELAYS, mean, error, color="grey", linestyle="none", marker="x", capsize=3,

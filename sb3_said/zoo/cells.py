@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -107,22 +107,43 @@ def make_table(cells: list[Cell], rows: Mapping[str, str]) -> Table:
     }
 
 
+class Manners(NamedTuple):
+    """How an agent moves, over all that it played."""
+
+    worst_tenth: float
+    """of its returns"""
+    ended: float | None
+    """part of the episodes that the task ended; None where that was not counted, as the next"""
+    change: float | None
+    """of the actions, from step to step"""
+
+
+def manners_of(cells: Iterable[Cell]) -> Manners | None:
+    """Return how the agent of these cells moves where the age was told right; None where nothing was played."""
+    played = [cell.result for cell in cells if cell.result and not cell.age_error]
+    if not played:
+        return None
+    returns = [x for result in played for x in result["returns"]]
+    ended = [x for result in played if (x := result.get("terminations")) is not None]
+    changes = [x["value"] for result in played if (x := result.get("mean_action_change"))]
+    return Manners(
+        worst_tenth(returns), sum(ended) / len(returns) if ended else None, float(np.mean(changes)) if changes else None
+    )
+
+
 def print_manners(cells: list[Cell], rows: Mapping[str, str]) -> None:
-    """Print how each row's agent moves, over all that it played with the age told right.
+    """Print how each row's agent moves.
 
     :param rows: as of :func:`make_table`
     """
     for agent, name in rows.items():
-        played = [cell.result for cell in cells if cell.agent == agent and cell.result and not cell.age_error]
-        returns = [x for result in played for x in result["returns"]]
-        ended = [x for result in played if (x := result.get("terminations")) is not None]
-        changes = [x["value"] for result in played if (x := result.get("mean_action_change"))]
-        if played:
-            words = [f"{name}: worst tenth of returns {worst_tenth(returns):.1f}"]
-            if ended:
-                words.append(f"{sum(ended) / len(returns):.0%} of the episodes ended by the task")
-            if changes:
-                words.append(f"actions change by {np.mean(changes):.3f} a step")
+        manners = manners_of(cell for cell in cells if cell.agent == agent)
+        if manners is not None:
+            words = [f"{name}: worst tenth of returns {manners.worst_tenth:.1f}"]
+            if manners.ended is not None:
+                words.append(f"{manners.ended:.0%} of the episodes ended by the task")
+            if manners.change is not None:
+                words.append(f"actions change by {manners.change:.3f} a step")
             print(", ".join(words))
 
 

@@ -107,7 +107,7 @@ def read_command_line(argv: list[str]) -> tuple[Run, str, list[str]]:
     options, zoo_argv = own_parser().parse_known_args(argv)
     zoo_argv = [*joined_settings(zoo_argv), *(["--help"] if options.help else [])]
     if options.num_threads is not None or options.resume is None:  # whose own number stands before
-        zoo_argv.append(f"--num-threads={options.num_threads or 1}")
+        zoo_argv.append(f"--num-threads={1 if options.num_threads is None else options.num_threads}")
     delay, expert_delay = read_delay(options.delay), read_delay(options.expert_delay)
     if options.resume is not None:
         record = Record.read(options.resume)
