@@ -53,8 +53,9 @@ def test_a_robot_observes_what_the_wrapper_hands_out(name: str, n_there: int, n_
         wanted.append(env.step(action)[0])
         return action, None
 
-    names: dict[str, Any] = {"D": 6, "act_dim": env.action_space.shape[0], "robot": Robot(name, n_there, n_back)}
-    names["model"] = SimpleNamespace(warmup=lambda: None, predict=predict, action_space=env.action_space)
+    names: dict[str, Any] = {"act_dim": env.action_space.shape[0], "robot": Robot(name, n_there, n_back)}
+    policy = SimpleNamespace(max_delay=6)
+    names["model"] = SimpleNamespace(warmup=lambda: None, predict=predict, action_space=env.action_space, policy=policy)
     exec("from collections import deque" + START, names)
     for _ in range(12):
         exec("# " + STEP, names)
