@@ -39,8 +39,10 @@ class ReturnScale(nn.Module):
         self.largest.fill_(max(float(self.largest), float(np.abs(returns).max())))
 
     @property
-    def value(self) -> float:
-        return max(float(self.variance) ** 0.5, float(self.largest) / LARGEST_SCALED_RETURN) or 1.0
+    def value(self) -> th.Tensor:
+        """() float32, where the networks are: to read it would wait for a GPU, and no CUDA graph could have it."""
+        size = th.maximum(self.variance.sqrt(), self.largest / LARGEST_SCALED_RETURN).float()
+        return th.where(size > 0, size, 1.0)
 
 
 class StateNormalizer(nn.Module):

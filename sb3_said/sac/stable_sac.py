@@ -96,6 +96,9 @@ class StableSAC(DelayedSAC):
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         learn = super()._setup_learn(*args, **kwargs)
         self._running_returns = np.zeros(self.n_envs)
+        normalizer = self.policy.state_normalizer
+        if normalizer is not None and self.num_timesteps < float(normalizer.fitted_at):
+            normalizer.fitted_at.zero_()  # steps are counted anew, as of another task
         return learn
 
     def _sample_action(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -192,7 +195,7 @@ class StableSAC(DelayedSAC):
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/ent_coef", float(self._ent_coef()))
-        self.logger.record("train/reward_scale", scale)
+        self.logger.record("train/reward_scale", float(scale))
         for name, values in losses.items():
             if values:
                 self.logger.record(f"train/{name}", float(np.mean(values)))

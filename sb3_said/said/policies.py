@@ -291,6 +291,18 @@ class SAIDPolicy(DelayedSACPolicy):
             return self._plan(observation, repeats=deterministic).action
         return super()._predict(observation if is_experts else self._as_if_seen(observation), deterministic)
 
+    def answer_without_noise(self, observation: dict[str, th.Tensor]) -> th.Tensor:
+        """Return what the planner decides at temperature 0, or the actor on its guess where that decides: (B, act_dim).
+
+        :param observation: of (B, ...), as of a delayed task; without delay, its history has no steps
+        """
+        if self.planner.config.decided_by == "actor":
+            is_delayed = isinstance(self.observation_space, spaces.Dict)
+            seen = self._as_if_seen(observation) if is_delayed else observation[KEYS[0]]
+            return super()._predict(seen, deterministic=True)
+        state, history, delay = (observation[key] for key in KEYS)
+        return self.planner.plan(state, history, delay[:, 0].long(), temperature=0.0).action
+
     def _as_if_seen(self, observation: PyTorchObs) -> PyTorchObs:
         """Return observations of age 0, of the present that the planner's first guess has for each row."""
         if not isinstance(observation, dict):

@@ -29,7 +29,7 @@ from sb3_said.said.callbacks import PlannerTrainingCallback
 from sb3_said.said.policies import Answer, SAIDPolicy, Value
 from sb3_said.said.student import Distillation, distill
 from sb3_said.said.training import PlannerTraining
-from sb3_said.said.trial import let_the_best_answer, ways_of
+from sb3_said.said.trial import check_scored, let_the_best_answer, ways_of
 
 HELD_OUT = 0.05  # of the planner's data
 HAND_OVER_INTERVAL = 100  # updates of an offline training
@@ -95,22 +95,22 @@ class SAID(OfflineAlgorithm, StableSAC):
         student_width: int | None = None,
         **sac_kwargs: Any,
     ):
-        for name, count in (("gradient_steps", planner_gradient_steps), ("train_freq", planner_train_freq)):
-            if count is not None and count < 1:
-                raise ValueError(f"planner_{name} must be at least 1, got {count}.")
+        counts = {"gradient_steps": planner_gradient_steps, "train_freq": planner_train_freq}
+        for name, count in {**counts, "trial_episodes": planner_trial_episodes}.items():
+            least = 0 if name == "trial_episodes" else 1
+            if count is not None and (count < least or count != int(count)):
+                raise ValueError(f"planner_{name} must be a whole number, at least {least}, got {count}.")
         if not 0.0 < planner_newest_fraction <= 1.0:
             raise ValueError(
                 f"planner_newest_fraction is a part of the buffer in (0, 1], got {planner_newest_fraction}."
             )
-        if planner_trial_episodes < 0:
-            raise ValueError(f"planner_trial_episodes must be 0 or more, got {planner_trial_episodes}.")
         self._given_planner_kwargs = planner_kwargs or {}
-        self.planner_gradient_steps = planner_gradient_steps
-        self.planner_train_freq = planner_train_freq
+        self.planner_gradient_steps = int(planner_gradient_steps)  # 1e4 is a float in YAML and in -params
+        self.planner_train_freq = None if planner_train_freq is None else int(planner_train_freq)
         self.planner_newest_fraction = planner_newest_fraction
         self.planner_terminal_penalty = planner_terminal_penalty
-        self.planner_trial_episodes = planner_trial_episodes
-        self.planner_ways = ways_of(planner_ways, self._given_planner_kwargs)
+        self.planner_trial_episodes = int(planner_trial_episodes)
+        self.planner_ways = ways_of(planner_ways, self._given_planner_kwargs, value)
         self.value = value
         self.iql_kwargs = asdict(settings_of(IQLConfig, iql_kwargs, "IQL"))
         self.student_width = student_width
@@ -208,11 +208,7 @@ class SAID(OfflineAlgorithm, StableSAC):
                 f"Only {', '.join(SAMPLING_SETTINGS)} can be changed, got {', '.join(others)}; "
                 "give it as planner_kwargs of a new agent."
             )
-        if settings.get("scored_states") == "decision" and self.policy.values is not None:
-            raise ValueError(
-                "scored_states='decision' scores candidates at the present that they share, where V(s) tells no action "
-                "from another: use 'future' or 'all'."
-            )
+        check_scored(settings, self.policy.values is not None)
         if settings.get("decided_by") == "actor" and self._n_updates == 0:
             raise ValueError("decided_by='actor' lets the expert's actor decide, which this agent has not trained.")
         self.policy.planner.config = replace(self.policy.planner.config, **settings)
@@ -412,6 +408,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         """
         total = self.planner_gradient_steps if gradient_steps is None else gradient_steps
         watcher = self._begin_offline(dataset, total, callback, tb_log_name, True, progress_bar)
+        self.planner_ways = ways_of(self.planner_ways, self.planner_kwargs, "iql")
         self.value, self.planner_newest_fraction = "iql", 1.0  # no step of a log is newer than another
         self.policy.set_value("iql")
         trainer, values = self.make_planner_trainer(total), self._make_value_trainer()
@@ -422,10 +419,14 @@ class SAID(OfflineAlgorithm, StableSAC):
             raise KeyboardInterrupt
         watcher.on_training_start(locals() | {"total_timesteps": total, "callback": watcher}, globals())
 
+        is_new = True
+
         def on_step(n_updates: int) -> bool:
+            nonlocal is_new
             self.num_timesteps = n_updates
-            if n_updates % HAND_OVER_INTERVAL == 0 or n_updates == 1:  # else an expert that learns nothing would answer
+            if is_new or n_updates % HAND_OVER_INTERVAL == 0:  # else an expert that learns nothing would answer
                 training.hand_over()
+                is_new = False
             return self._goes_on(watcher)
 
         outcome = training.run(should_stop=should_stop, on_step=on_step)

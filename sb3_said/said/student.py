@@ -188,12 +188,9 @@ def _loss(model: SAID, batch: _Rows, q_weight: float) -> th.Tensor:
 
 @th.no_grad()
 def _labelled(model: SAID, parts: dict[str, th.Tensor], presents: th.Tensor) -> _Rows:
-    """Ask the planner at temperature 0 about delayed observations."""
+    """Ask the planner at temperature 0 about delayed observations, or the actor on its guess where that decides."""
     batches = zip(*(parts[key].split(LABELLED_AT_ONCE) for key in KEYS), strict=True)
-    labels = [
-        model.policy.planner.plan(states, history, delay[:, 0].long(), temperature=0.0).action
-        for states, history, delay in batches
-    ]
+    labels = [model.policy.answer_without_noise(dict(zip(KEYS, batch, strict=True))) for batch in batches]
     is_delayed = isinstance(model.observation_space, spaces.Dict)
     inputs = model.policy.student.read(parts if is_delayed else parts["observation"])
     return _Rows(inputs, th.cat(labels), presents)

@@ -14,6 +14,7 @@ from tqdm.auto import tqdm
 
 from sb3_said.delays.space import KEYS
 from sb3_said.planner.config import SAMPLING_SETTINGS, PlannerConfig
+from sb3_said.sac.policies import settings_of
 
 SAID = Any  # whose module imports this one
 
@@ -43,15 +44,20 @@ class Trial:
     """taken by all together, those of environments that wait for the others, too"""
 
 
-def ways_of(given: dict[str, dict[str, Any]] | None, planner_kwargs: dict[str, Any]) -> dict[str, dict[str, Any]]:
+def ways_of(
+    given: dict[str, dict[str, Any]] | None, planner_kwargs: dict[str, Any], value: str
+) -> dict[str, dict[str, Any]]:
     """Return the ways to compare: those given, or ``WAYS``; none where ``planner_kwargs`` says how to decide.
 
-    :raises ValueError: for other settings than those of ``set_planner``, and for values outside their range
+    :param value: who scores candidates, as of :class:`~sb3_said.said.SAID`
+    :raises ValueError: for other settings than those of ``set_planner``, and for values outside their range, or that
+        this planner cannot have
     """
+    own = settings_of(PlannerConfig, planner_kwargs, "The planner")
     if given is None:
         if set(SAMPLING_SETTINGS) & set(planner_kwargs):
             return {}
-        can_guess = PlannerConfig(**planner_kwargs).present == "guessed"
+        can_guess = own.present == "guessed"
         return {name: way for name, way in WAYS.items() if can_guess or way["decided_by"] == "plan"}
     for name, settings in given.items():
         if name in ("planner", "expert") or not set(settings) <= set(SAMPLING_SETTINGS):
@@ -59,8 +65,23 @@ def ways_of(given: dict[str, dict[str, Any]] | None, planner_kwargs: dict[str, A
                 f"planner_ways has {name!r}: {settings}; expected another name than 'planner' and 'expert', with "
                 f"settings from {', '.join(SAMPLING_SETTINGS)}."
             )
-        PlannerConfig(**settings)
+        replace(own, **settings)
+        check_scored(settings, value == "iql")
     return given
+
+
+def check_scored(settings: dict[str, Any], is_by_state: bool) -> None:
+    """Refuse ways to score candidates in which V(s) would see no difference.
+
+    :param settings: of :meth:`~sb3_said.said.SAID.set_planner`
+    :param is_by_state: whether V(s) scores, and not Q(s, a)
+    :raises ValueError: for ``scored_states="decision"`` where V(s) scores
+    """
+    if settings.get("scored_states") == "decision" and is_by_state:
+        raise ValueError(
+            "scored_states='decision' scores candidates at the present that they share, where V(s) tells no action "
+            "from another: use 'future' or 'all'."
+        )
 
 
 def play_trial(
@@ -79,7 +100,8 @@ def play_trial(
     """
     seed, own = int(np.random.randint(2**31)), model.policy.planner.config
     ways = {name: replace(own, **settings) for name, settings in model.planner_ways.items()}
-    can_act = 0 in (model.trained_ages or []) and model.policy.max_delay > 0  # without delay the actor is the expert
+    can_act = model._n_updates > 0 and 0 in (model.trained_ages or [])
+    can_act &= model.policy.max_delay > 0  # without delay the actor is the expert
     others = {name: way for name, way in ways.items() if way != own and (way.decided_by == "plan" or can_act)}
     returns, ages, n_steps = {}, {}, 0
     try:

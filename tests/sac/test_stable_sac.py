@@ -110,6 +110,18 @@ def test_what_actor_and_critics_read_of_states():
     th.testing.assert_close(actor[:, -1:], batch["delay"] / 3)  # ages and actions as they are
 
 
+def test_steps_that_are_counted_anew_have_their_states_looked_at():
+    model = make(delayed(3)).learn(200)
+    normalizer = model.policy.state_normalizer
+    assert normalizer.fitted_at > 100
+    normalizer.mean.fill_(1e6)  # as of another task
+    model.learn(40, reset_num_timesteps=False)
+    assert normalizer.mean.abs().max() < 100
+    normalizer.mean.fill_(1e6)
+    model.learn(40)
+    assert normalizer.mean.abs().max() < 100 and normalizer.fitted_at <= 40
+
+
 def test_one_update_is_that_of_the_formulas():
     model = make(learning_starts=1000).learn(50)
     model.policy.state_normalizer.fit(th.randn(100, 2) * 3, 10**9)  # not looked at again

@@ -182,6 +182,14 @@ def test_a_resumed_training_ends_as_one_that_never_stopped(tmp_path):
     th.testing.assert_close(weights(resumed_training), whole, rtol=0, atol=0)
 
 
+def test_callbacks_of_a_resumed_training_meet_the_planner(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        learn(folder=tmp_path, save_interval=2, should_stop=lambda: (tmp_path / "planner_checkpoint.zip").exists())
+    answered = []
+    learn(folder=tmp_path, callback=lambda a, _: answered.append(a["self"].policy.who_answers) or True)
+    assert answered[-1] == "planner" and "expert" not in answered[1:]  # but of the call before the first update
+
+
 def test_a_failed_training_changes_nothing(monkeypatch):
     model = make(value="iql").learn(60)
     before = weights(model)

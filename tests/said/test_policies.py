@@ -12,6 +12,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_said import SAID, DelayedObservationWrapper, StableSAC
 from sb3_said.delays import UniformDelay
@@ -24,6 +25,23 @@ def test_value_is_the_smallest_critic(trained):
     expected = th.minimum(*critics).reshape(3, 4, 5) * policy.return_scale.value  # in units of rewards
     assert not th.equal(critics[0], critics[1])
     th.testing.assert_close(policy.value(states, actions), expected)
+
+
+class ReadingBack(TorchDispatchMode):
+    """Fails where a number of a tensor is read in Python: on a GPU that waits, and no CUDA graph can be recorded."""
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        assert "_local_scalar_dense" not in str(func), "a number is read back"
+        return func(*args, **(kwargs or {}))
+
+
+def test_no_number_is_read_back_where_candidates_are_scored(trained):
+    states, actions = th.randn(3, 4, 5, 2), th.rand(3, 4, 5, 1) * 2 - 1
+    with ReadingBack():
+        values = trained.policy.value(states, actions)
+    assert th.equal(values, trained.policy.value(states, actions)) and trained.policy.return_scale.value != 1
+    with pytest.raises(AssertionError, match="read back"), ReadingBack():
+        float(values.detach()[0, 0, 0])
 
 
 class Scaled(FlattenExtractor):

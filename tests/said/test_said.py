@@ -148,8 +148,10 @@ def test_settings_that_cannot_be_changed_are_refused(saved, given, message):
     [
         ({"planner_kwargs": {"dept": 2}}, "no setting dept; it has depth"),
         ({"planner_kwargs": {"horizon": 1}}, "horizon is 1"),
-        ({"planner_gradient_steps": 0}, "planner_gradient_steps must be at least 1"),
-        ({"planner_train_freq": 0}, "planner_train_freq must be at least 1"),
+        ({"planner_gradient_steps": 0}, "planner_gradient_steps must be a whole number, at least 1, got 0"),
+        ({"planner_gradient_steps": 2.5}, "planner_gradient_steps must be a whole number, at least 1, got 2.5"),
+        ({"planner_train_freq": 0}, "planner_train_freq must be a whole number, at least 1, got 0"),
+        ({"planner_trial_episodes": -1}, "planner_trial_episodes must be a whole number, at least 0, got -1"),
         ({"planner_newest_fraction": 0.0}, r"in \(0, 1\], got 0"),
         ({"planner_newest_fraction": 1.5}, r"in \(0, 1\], got 1.5"),
         ({"delay_reconciled_critic": False}, "must read true states"),
@@ -158,6 +160,16 @@ def test_settings_that_cannot_be_changed_are_refused(saved, given, message):
 def test_arguments_that_cannot_work_are_refused(kwargs, message):
     with pytest.raises(ValueError, match=message):
         make(**kwargs)
+
+
+def test_an_unknown_setting_is_told_where_no_other_is_given():
+    with pytest.raises(ValueError, match="The planner has no setting dept; it has depth"):
+        SAID("MlpPolicy", delayed(), planner_kwargs={"dept": 2}, buffer_size=100, device="cpu")
+
+
+def test_counts_may_be_written_as_floats():
+    model = make(planner_gradient_steps=1e1, planner_trial_episodes=0.0).learn(40)
+    assert model.policy.planner_updates == 10
 
 
 @pytest.mark.parametrize(

@@ -107,6 +107,21 @@ def test_the_labels_are_the_planners_at_temperature_0_at_every_age(taught, monke
         assert not history[k, : 2 - age].any()
 
 
+@pytest.mark.parametrize("is_delayed", [True, False])
+def test_the_labels_are_the_actors_where_it_decides_on_the_guess(is_delayed):
+    model = make(env=None if is_delayed else Drift(length=30)).learn(60)
+    model.set_planner(decided_by="actor")
+    model.policy.make_student(8)
+    rows = student_module._visited(model, "planner", 25, th.Generator().manual_seed(0))
+    with model.borrowed_env() as env, model.policy.answering("planner"):
+        env.seed(int(th.randint(2**31, (), generator=th.Generator().manual_seed(0))))
+        obs = env.reset()
+        for label in rows.labels:
+            action = model.predict(obs, deterministic=True)[0]
+            np.testing.assert_allclose(model.policy.scale_action(action)[0], label, atol=1e-5)
+            obs = env.step(action)[0]
+
+
 def test_a_file_keeps_it_and_who_answers(taught, tmp_path):
     assert taught.policy.who_answers == "planner" and taught.policy.answers == ["planner", "expert", "student"]
     taught.set_answer("student")

@@ -210,6 +210,25 @@ def test_ways_that_are_given_are_checked_and_settings_of_the_users_own_are_kept(
             make(planner_ways=wrong)
 
 
+@pytest.mark.parametrize(
+    ("way", "kwargs", "message"),
+    [
+        ({"decided_by": "actor"}, {"planner_kwargs": {"first_guess": "none"}}, "present='inpainted'"),
+        ({"present": "inpainted"}, {"planner_kwargs": {"mask": "none"}}, "mask"),
+        ({"scored_states": "decision"}, {"value": "iql"}, "scored_states='decision'"),
+    ],
+)
+def test_a_way_that_the_agent_cannot_have_is_refused_before_anything_is_learned(way, kwargs, message):
+    assert make(planner_ways={"x": way}).planner_ways == {"x": way}
+    with pytest.raises(ValueError, match=message):
+        make(planner_ways={"x": way}, **kwargs)
+
+
+def test_an_expert_without_updates_acts_on_no_guess():
+    model = make(env=pendulum(delay=(0, 2)), planner_ways={"actor": trial.WAYS["actor"]}, learning_starts=100).learn(60)
+    assert list(trial.play_trial(model, n_episodes=1).returns) == ["planner", "expert"]
+
+
 @pytest.mark.parametrize("better", ["planner", "expert"])
 def test_the_better_one_answers_also_after_saving(better, monkeypatch, tmp_path):
     rigged(monkeypatch, planner=[0.0, 3.0] if better == "planner" else [0.0, 1.0], expert=[1.0, 1.0])
