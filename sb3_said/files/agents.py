@@ -54,7 +54,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
         metadata names the task, where it is a registered one.
 
         :param path: where to write; without a suffix, ``.zip`` is added. Or a binary file object.
-        :param compact: write matrices as float16 and no state of optimizers, as a quarter of the size is better to hand
+        :param compact: write matrices as float16 and no state of optimizers: two fifths of the size, to hand
             on. Actions then differ in their last digits, and training goes on with fresh optimizers
         :raises ValueError: for spaces other than Box and Dict of Box
         """

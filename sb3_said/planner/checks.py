@@ -2,7 +2,21 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch as th
+
+
+def check_same(what: str, before: dict[str, Any], now: dict[str, Any], advice: str) -> None:
+    """Compare settings.
+
+    :param what: has them, and how it began, for the error
+    :param advice: what to do
+    :raises ValueError: naming those that differ
+    """
+    if differing := [key for key in sorted({*before, *now}) if before.get(key) != now.get(key)]:
+        changes = "; ".join(f"{key} was {before.get(key)} and is now {now.get(key)}" for key in differing)
+        raise ValueError(f"{what} with other settings: {changes}. {advice}")
 
 
 def float_tensor(name: str, values: th.Tensor, shape: tuple[int | None, ...], device: th.device) -> th.Tensor:

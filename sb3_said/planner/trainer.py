@@ -11,6 +11,7 @@ from typing import Any
 import torch as th
 import torch.nn.functional as F
 
+from sb3_said.planner.checks import check_same
 from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.first_guess import GUESS_BATCH_SIZE, fit_first_guess
 from sb3_said.planner.graphs import RecordedFunction
@@ -309,14 +310,8 @@ class PlannerTrainer:
 
         :raises ValueError: when that training had other settings, so that the end would be neither's
         """
-        saved, given = state["settings"], self._settings
-        if saved != given:
-            differing = [key for key in sorted(saved | given) if saved.get(key) != given.get(key)]
-            raise ValueError(
-                "Training can only resume with the settings and data it began with, but these differ: "
-                + "; ".join(f"{key} was {saved.get(key)} and is now {given.get(key)}" for key in differing)
-                + ". Resume with the old ones, or start a new training."
-            )
+        advice = "Resume with the settings and data that it began with, or start a new training."
+        check_same("The stored training was begun", state["settings"], self._settings, advice)
         if not _is_finite({name: value for name, value in state.items() if name != "generator"}):
             raise ValueError("The stored training holds NaN or infinite numbers; start a new one.")
         if type(state["n_updates"]) is not int or not 0 <= state["n_updates"] <= self.gradient_steps:

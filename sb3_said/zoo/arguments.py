@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import gymnasium as gym
+
 from sb3_said.delays.text import age_range, make_process
 
 #: A delay as YAML has it: control steps, [low, high], or a process as text; None for a task without the wrapper.
@@ -75,7 +77,7 @@ def explained(parser: argparse.ArgumentParser) -> Iterator[None]:
     """Turn errors that a user can mend into a message without a traceback."""
     try:
         yield
-    except ValueError as error:
+    except (ValueError, gym.error.Error) as error:
         parser.error(str(error))
     except (ImportError, OSError) as error:
         parser.exit(1, f"{error}\n")

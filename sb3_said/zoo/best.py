@@ -20,7 +20,7 @@ def write_best(run: Path, folder: Path, planner: dict[str, Any], choice: str) ->
 
     :param run: folder of the run that was tuned
     :param folder: to write to
-    :param planner: its settings that were tried
+    :param planner: its settings that the trials had beside the run's arguments
     :param choice: how they were chosen, for a comment
     """
     record = Record.read(run)
@@ -37,7 +37,7 @@ def write_best(run: Path, folder: Path, planner: dict[str, Any], choice: str) ->
     command = shlex.join([*words, "-conf", str(folder / "best.yml")])
 
     block, left_out = plain_settings(record)
-    lines = [f"{', '.join(planner)}: {choice}; see results.json.", command]
+    lines = [f"{choice}; see results.json.", command]
     lines += [f"Left out, as YAML cannot hold it: {name}" for name in left_out]
     text = "".join(f"# {line}\n" for line in lines) + yaml.safe_dump({record.env: block}, sort_keys=False)
     write_text(folder / "best.yml", text)

@@ -26,7 +26,7 @@ class Cell:
 
     agent: str
     answer: str | None
-    """planner or expert of a SAID agent"""
+    """who acts in a SAID agent"""
     delay: int | str
     """control steps, or a process as it was written"""
     algo: str
@@ -60,16 +60,16 @@ class Results:
 
     :param path: of the file; new where there is none
     :param settings: what all cells have in common; those of the file by default
-    :raises ValueError: for a file with other settings, and without settings for a file that is not there
+    :raises ValueError: for a file of another kind or with other settings, and for none without settings
     """
 
     def __init__(self, path: Path, settings: dict[str, Any] | None = None):
         self.path = path
         if settings is None and not path.exists():
             raise ValueError(f"{path} does not exist, and no runs are given: name the runs to play.")
-        document = json.loads(path.read_text()) if path.exists() else {**(settings or {}), "origins": [], "cells": []}
-        self.origins: list[dict[str, Any]] = document.pop("origins", [])
-        self.cells = [Cell(**entry) for entry in document.pop("cells", [])]
+        document = _read(path) if path.exists() else {**(settings or {}), "origins": [], "cells": []}
+        self.origins: list[dict[str, Any]] = document.pop("origins")
+        self.cells = [Cell(**entry) for entry in document.pop("cells")]
         self.settings = document if settings is None else settings
         if document != self.settings:
             raise ValueError(f"{path} holds {document}, but {settings} is to be played: give another --json.")
@@ -88,6 +88,16 @@ class Results:
         """Write the file, whole or not at all, without the cells that are still to be played."""
         cells = [asdict(cell) for cell in self.cells if cell.result is not None or cell.obstacle is not None]
         write_json(self.path, {**self.settings, "origins": self.origins, "cells": cells})
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_text())
+        if {"env", "n_episodes", "seed", "origins", "cells"} <= set(document):
+            return dict(document)
+    except (ValueError, TypeError):
+        pass  # no JSON, or a number
+    raise ValueError(f"{path} is no file of over-delays: give another --json.")
 
 
 def make_table(cells: list[Cell], rows: Mapping[str, str]) -> Table:

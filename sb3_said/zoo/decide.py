@@ -23,7 +23,7 @@ examples:
       -o logs/said/Hopper-v5-delay4-seed1_1/weighed.zip
   sb3-said evaluate logs/said/Hopper-v5-delay4-seed1_1/weighed.zip
 
-  # a quarter of the size, to hand on: weights as float16, and nothing that only training needs
+  # two fifths of the size, to hand on: weights as float16, and nothing that only training needs
   sb3-said decide logs/said/Hopper-v5-delay4-seed1_1 --compact -o hopper.zip
 
   # the expert while the observation is at most 4 steps old, the planner beyond

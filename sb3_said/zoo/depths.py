@@ -13,6 +13,7 @@ from stable_baselines3.common.logger import Logger, make_output_format
 
 from sb3_said.files.archive import load_tree, readable, save_tree
 from sb3_said.files.checks import check_tensors
+from sb3_said.planner.checks import check_same
 from sb3_said.said import SAID
 from sb3_said.said.training import PLANNER_CHECKPOINT_NAME
 from sb3_said.zoo.folder import log_suffix
@@ -139,13 +140,3 @@ class DepthPlanners:
         if int(self.model.policy.planner_updates) < self.gradient_steps:
             raise KeyboardInterrupt  # what was learned is kept, but half a planner serves no comparison
         (folder / PLANNER_CHECKPOINT_NAME).unlink(missing_ok=True)
-
-
-def check_same(what: str, before: dict[str, Any], now: dict[str, Any], advice: str) -> None:
-    """Compare settings.
-
-    :raises ValueError: naming those that differ
-    """
-    if differing := [key for key in sorted({*before, *now}) if before.get(key) != now.get(key)]:
-        changes = "; ".join(f"{key} was {before.get(key)} and is now {now.get(key)}" for key in differing)
-        raise ValueError(f"{what} with other settings: {changes}. {advice}")

@@ -115,6 +115,7 @@ class DelayedExperimentManager(ExperimentManager):
             )
         self.run = run
         self.stopping = Stopping()
+        self._of_expert = True  # are the environments made now
         self.lock: FileLock | None = None
         self._uuid = zoo_kwargs.get("uuid_str", "")
         given = self.custom_hyperparams or {}
@@ -128,6 +129,10 @@ class DelayedExperimentManager(ExperimentManager):
             self.eval_env_kwargs = {**run.record.eval_env_kwargs, **self.eval_env_kwargs}
         else:
             overrides = preset_overrides(self.config, run.preset, env_id, run.delay, run.max_delay, run.dataset)
+            if (
+                run.expert_delay is not None
+            ):  # whose environment would tell who is better there, and not under the other
+                overrides["planner_trial_episodes"] = 0
             self.custom_hyperparams = with_given({**overrides, **ALGORITHMS[algo][1]}, given)
 
     def release(self) -> None:
@@ -141,6 +146,10 @@ class DelayedExperimentManager(ExperimentManager):
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Read them as rl_zoo3 does, with the delay around the user's own wrappers, and text that is code evaluated."""
         hyperparams, saved = super().read_hyperparameters()
+        if self.run.record is not None:  # the run has all of its own, and none of what its YAML holds today
+            for settings in (hyperparams, saved):
+                for name in set(settings) - set(self.custom_hyperparams or {}):
+                    del settings[name]
         for name in EVALUATED:
             if isinstance(text := saved.get(name), str):
                 saved[name], hyperparams[name] = (eval(text, vars(exp_manager)) for _ in range(2))
@@ -156,10 +165,13 @@ class DelayedExperimentManager(ExperimentManager):
     def create_envs(self, *args: Any, **kwargs: Any) -> VecEnv:
         """Make environments of the expert's delay, in training as in the evaluations beside it.
 
-        The run's settings on disk keep the delay that the agent is for.
+        The run's settings on disk keep the delay that the agent is for, and its own evaluation is under that.
         """
         if self.run.expert_delay is not None:
-            self.env_wrapper = make_wrapper(with_delay(self._own_wrappers, self.run.expert_delay, self.run.delay))
+            delays = self.run.expert_delay, self.run.delay
+            self.env_wrapper = make_wrapper(
+                with_delay(self._own_wrappers, *(delays if self._of_expert else delays[::-1]))
+            )
         with shielded():
             return super().create_envs(*args, **kwargs)
 
@@ -277,6 +289,10 @@ class DelayedExperimentManager(ExperimentManager):
         model.learn(steps, **how)
         is_answer = isinstance(model, SAID) and model.policy.planner_is_trained
         if is_answer and self.evaluation is not None and not self.stopping.is_asked:
+            if self.run.expert_delay is not None:
+                self.evaluation.eval_env.close()
+                self._of_expert = False
+                self.evaluation.eval_env = self.create_envs(self.n_eval_envs, eval_env=True)
             evaluate_answer(model, self.evaluation, self.folder, self.stopping)
 
     def _save_checkpoint(self) -> bool:

@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_said.files.checkpoint import TrainingCheckpointCallback
 from sb3_said.offline import OfflineAlgorithm
 from sb3_said.said import SAID
+from sb3_said.said.training import PLANNER_CHECKPOINT_NAME
 from sb3_said.zoo.arguments import ending_training
 from sb3_said.zoo.manager import DelayedExperimentManager, Run
 
@@ -78,4 +79,6 @@ class OfflineExperimentManager(DelayedExperimentManager):
         model.learn_offline(None, steps, progress_bar=self.show_progress, **how)
 
     def _save_checkpoint(self) -> bool:
-        return self.algo == "said" or super()._save_checkpoint()  # a planner's is written when it is asked to stop
+        if self.algo != "said":
+            return super()._save_checkpoint()
+        return (self.folder / PLANNER_CHECKPOINT_NAME).is_file()  # written when the planner was asked to stop

@@ -60,12 +60,13 @@ def main(argv: list[str] | None = None) -> None:
                         "docs/delays.md in quotes, such as 'DroppedPackets(4, p=0.1)'")  # fmt: skip
     parser.add_argument("--age-errors", type=int, nargs="+", default=[], metavar="STEPS", help="play each delay also "
                         "with the age told wrong by so many steps, such as -2 -1 1 2")  # fmt: skip
-    parser.add_argument("--answer", choices=ANSWERS, help="who acts in SAID agents (default: both, as two rows)")
+    parser.add_argument("--answer", choices=ANSWERS, help="who acts in SAID agents (default: "
+                        "everyone who can, each as a row)")  # fmt: skip
     parser.add_argument("--json", type=Path, required=True, help="file of the numbers, read and written")
     parser.add_argument("--plot", type=Path, help="draw return over delay to this .png or .pdf")
     parser.add_argument("--rows", nargs="+", metavar="ROW[=NAME]", help="rows of table and plot, in this order: "
-                        "each a label, or 'LABEL planner' or 'LABEL expert' of a SAID agent, shown as NAME (default: "
-                        "all)")  # fmt: skip
+                        "each a label, with who acts in a SAID agent, such as 'LABEL planner', shown as NAME "
+                        "(default: all)")  # fmt: skip
     add_playing(parser, episodes=50)
     parser.add_argument("--n-envs", type=int, default=8, help="episodes played side by side (default: 8)")
     parser.add_argument("--workers", type=int, default=1, help="cells played at once, in processes (default: 1)")
@@ -141,7 +142,7 @@ def play_missing(args: argparse.Namespace, delays: list[int | str]) -> list[Cell
     """Play the cells of the command line that are not known yet, and write each as it is done.
 
     :return: all cells of the command line
-    :raises ValueError: for runs that cannot be opened or compared, and without a delay
+    :raises ValueError: for runs that cannot be opened or compared, without a delay, and where nobody can play
     """
     if not delays:
         raise ValueError("--delays is missing: name the delays that the runs are to play.")
@@ -150,6 +151,12 @@ def play_missing(args: argparse.Namespace, delays: list[int | str]) -> list[Cell
     settings = {"env": first.info["env"], "n_episodes": args.episodes, "seed": args.seed, "deterministic": True}
     results = Results(args.json, settings)
     cells = [cell for label, row in runs.items() for cell in cells_of(label, row, delays, args.answer)]
+    if not cells:
+        raise ValueError(
+            f"There is nothing to play: no run can answer as --answer {args.answer}."
+            if args.answer
+            else f"There is nothing to play: no run is of the delays {', '.join(map(str, delays))}."
+        )
     errors = [0, *(error for error in dict.fromkeys(args.age_errors) if error)]
     cells = [replace(cell, age_error=error) for error in errors for cell in cells]
     choose_rows(args.rows, cells)
@@ -219,7 +226,7 @@ def cells_of(label: str, row: list[LoadedRun], delays: list[int | str], only: st
     """Make the cells of a label: each who can answer, under each delay.
 
     :param row: runs of one delay, which play all delays; or of several, of which each plays its own
-    :param only: who of a SAID agent is to answer, planner or expert; both by default
+    :param only: who of a SAID agent is to answer; by default everyone who can
     """
     one_delay = len({run.info["delay"] for run in row}) == 1
     digests = [digest_of(run) for run in row]
@@ -243,11 +250,12 @@ def obstacle(model: Any, answer: str | None, delay: int | str) -> str | None:
     """Say why an agent cannot play under a delay; None where it can.
 
     :param model: an SB3 algorithm, whose policy has a planner where that answers
+    :param answer: who acts in a SAID agent
     """
     longest = longest_delay(model) or 0
     if largest_delay(delay) > longest:
         return f"it was built for delays 0..{longest}"
-    if answer == "planner":
+    if answer not in (None, "expert"):
         low, high = age_range(delay)
         try:
             model.policy.planner.check_ages(list(range(low, high + 1)))
@@ -276,7 +284,7 @@ def play(
 ) -> Summary:
     """Play the episodes of a cell."""
     with at_any_age():
-        run = load_run(cell.file, cell.algo, env_id, cell.delay, device, gym_packages=gym_packages)
+        run = load_run(cell.file, cell.algo, env_id, cell.delay, device, gym_packages=gym_packages, answer=cell.answer)
         with answering(run.model, cell.answer, at_once=True):
             played = run.play(episodes, seed, n_envs, age_error=cell.age_error)
     measured = played.terminated, played.action_changes

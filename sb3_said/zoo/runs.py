@@ -76,6 +76,7 @@ def load_run(
     device: str = "auto",
     env_kwargs: dict[str, Any] | None = None,
     gym_packages: Sequence[str] = (),
+    answer: str | None = None,
 ) -> LoadedRun:
     """Open a run.
 
@@ -89,8 +90,10 @@ def load_run(
     :param device: torch device
     :param env_kwargs: more arguments for ``gymnasium.make``, such as ``render_mode``
     :param gym_packages: modules that register the task, beside those that the run remembers
+    :param answer: who is to play in a SAID agent, and so must know the delay; as the file says by default
     :raises ImportError: for a module that is not there
-    :raises ValueError: when the files do not say what to load, or the agent does not fit the task
+    :raises ValueError: when the files do not say what to load, the agent does not fit the task, or the task cannot be
+        made with these arguments
     """
     file, record = find_agent(Path(path))
     hyperparams = record.hyperparams if record is not None else {}
@@ -119,14 +122,18 @@ def load_run(
     kwargs = {**(record.env_kwargs if record is not None else {}), **(env_kwargs or {})}
 
     def make_env() -> gym.Env[Any, Any]:
-        env: gym.Env[Any, Any] = gym.make(env_id, **kwargs)
+        try:
+            env: gym.Env[Any, Any] = gym.make(env_id, **kwargs)
+        except TypeError as error:
+            raise ValueError(f"{env_id} cannot be made with {kwargs}: {error}") from error
         return env if wrap is None else wrap(env)
 
     env = make_env()
     _check_spaces(model, env, file)
     delay_process = env.get_wrapper_attr("process") if env.has_wrapper_attr("process") else FixedDelay(0)
     if isinstance(model, DelayedSAC):
-        model.check_ages(ages_of(env))
+        with answering(model, answer):
+            model.check_ages(ages_of(env))
     env.close()
     info = {"algo": algo, "env": env_id, "delay": delay_name(delay_process)}
     info |= {"file": str(file), "trained_steps": model.num_timesteps}

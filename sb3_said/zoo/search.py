@@ -18,7 +18,7 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.study import MaxTrialsCallback
 from optuna.trial import FrozenTrial, Trial, TrialState
 
-from sb3_said.zoo.depths import check_same
+from sb3_said.planner.checks import check_same
 
 optuna.logging.set_verbosity(optuna.logging.ERROR)
 

@@ -46,7 +46,11 @@ def own_parser() -> argparse.ArgumentParser:
     parser.add_argument("--env", help="task, of continuous actions (default: Pendulum-v1)")
     add_delay(parser, default="no delay")
     add_delay(
-        parser, "that of --delay", "--expert-delay", "delay that SAID's expert learns under; the planner serves --delay"
+        parser,
+        "that of --delay",
+        "--expert-delay",
+        "delay that SAID's expert learns under; the planner serves --delay, and no trial is played, as that would be "
+        "under the expert's",
     )
     parser.add_argument("--dataset", nargs="+", default=[], metavar="ID_OR_FILE", help="logs to learn from instead of "
                         "an environment, with --algo said, bc or dql: ids of Minari datasets, D4RL's .hdf5 files, .npz "
@@ -67,6 +71,9 @@ def own_parser() -> argparse.ArgumentParser:
         "minutes, and less often the larger the replay is)",
     )  # fmt: skip
     parser.add_argument("--resume", type=Path, metavar="RUN_DIR", help="go on with a run from its last checkpoint")
+    parser.add_argument(
+        "-i", "--trained-agent", type=os.path.abspath, help=argparse.SUPPRESS
+    )  # rl_zoo3's, from anywhere
     return parser
 
 
@@ -90,6 +97,10 @@ def main(argv: list[str] | None = None) -> None:
     sys.argv = [sys.argv[0], "--algo", algo, *zoo_argv]
     try:
         rl_zoo3.train.train()
+    except (AssertionError, ImportError, ValueError) as error:
+        if made:
+            raise
+        parser.error(str(error))  # of the options that rl_zoo3 reads
     finally:
         for manager in made:
             manager.release()
@@ -106,6 +117,7 @@ def read_command_line(argv: list[str]) -> tuple[Run, str, list[str]]:
     """
     options, zoo_argv = own_parser().parse_known_args(argv)
     zoo_argv = [*joined_settings(zoo_argv), *(["--help"] if options.help else [])]
+    zoo_argv += [] if options.trained_agent is None else [f"--trained-agent={options.trained_agent}"]
     if options.num_threads is not None or options.resume is None:  # whose own number stands before
         zoo_argv.append(f"--num-threads={1 if options.num_threads is None else options.num_threads}")
     delay, expert_delay = read_delay(options.delay), read_delay(options.expert_delay)

@@ -20,6 +20,7 @@ from sb3_said import SAID
 from sb3_said.evaluation import Latency, Summary
 from sb3_said.files.atomic import write_json
 from sb3_said.files.checkpoint import CHECKPOINT_NAME
+from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.zoo.arguments import TRUST, check_positive, explained, make_parser
 from sb3_said.zoo.best import write_best
 from sb3_said.zoo.depths import DepthPlanners
@@ -194,8 +195,11 @@ def report(args: argparse.Namespace, run: LoadedRun, study: Study, winner: Froze
         ]
     run.model.save(folder / "best.zip")
     trials = [trial_to_dict(trial) for trial in finished(study)]
-    choice = f"the best of {len(trials)} trials, mean return {winner.value:.1f} over {args.episodes} episodes"
-    command = write_best(args.run, folder, winner.params, choice)
+    choice = f"{', '.join(winner.params)}: the best of {len(trials)} trials, mean return {winner.value:.1f} over "
+    choice += f"{args.episodes} episodes; how the planner decides beyond that: as the run does"
+    assert isinstance(run.model, SAID)  # as open_run saw to
+    decides = {name: getattr(run.model.policy.planner.config, name) for name in SAMPLING_SETTINGS}
+    command = write_best(args.run, folder, decides | winner.params, choice)
     document = {
         **run.info,
         "settings": study.user_attrs["settings"],

@@ -130,6 +130,7 @@ def test_an_agent_without_its_run_folder(run: Path, tmp_path: Path) -> None:
     [
         (["--delay", "5"], "built for delays 0..2"),
         (["--env", "Hopper-v5"], "observation_space shapes"),
+        (["--env", "Pendulun-v1"], "Did you mean: `Pendulum`?"),
         (["--episodes", "0"], "at least 1"),
         (["--algo", "nonsense"], "give --algo"),
         (["--period", "0.02"], "needs --realtime"),
@@ -161,6 +162,7 @@ def test_paths_that_hold_no_agent(run: Path, tmp_path: Path) -> None:
     [
         (["--record", "film.avi"], "ending in .mp4 or .gif"),
         (["--record", "film.gif", "--fps", "0"], "at least 1"),
+        (["--record", "film.gif", "--env", "Pendulum-v1", "--size", "64"], "Pendulum-v1 cannot be made with"),
         ([], "no display"),
     ],
 )

@@ -239,7 +239,16 @@ def test_a_planner_of_one_delay_plays_no_other(said: Path) -> None:
     found = {delay: over_delays.obstacle(model, "planner", delay) for delay in (1, 2, "UniformDelay(0, 2)")}
     assert found.pop(2) is None
     assert all(reason.startswith("A planner with mask='fixed' plans at age 2 only") for reason in found.values())
-    assert over_delays.obstacle(model, "expert", 1) is None
+    assert over_delays.obstacle(model, "expert", 1) is None and over_delays.obstacle(model, "student", 1)
+
+
+def test_the_expert_of_a_planner_of_one_delay_plays_all(said: Path, tmp_path: Path) -> None:
+    model: Any = load_run(said, device="cpu").model
+    model.policy.make_planner(replace(model.policy.planner.config, mask="fixed", present="inpainted"))
+    model.policy.planner_updates.fill_(1.0)
+    model.save(tmp_path / "fixed.zip")
+    cells = by_cell(play(tmp_path / "out.json", [f"x={tmp_path / 'fixed.zip'}"], ["1", "2"], "--env", ENV))
+    assert {name for name, result in cells.items() if result} == {("x planner", 2), ("x expert", 1), ("x expert", 2)}
 
 
 def test_training_seeds_of_one_label_are_one_row(
@@ -314,6 +323,7 @@ def test_an_average_pairs_training_seeds_where_all_delays_have_as_many() -> None
         (["{said}"], ["--delays", "-1"], "whole number of control steps >= 0"),
         (["{said}"], ["--workers", "0"], "must be at least 1"),
         (["{said}"], ["--seed", "1"], "give another --json"),
+        (["{said}"], ["--answer", "student"], "no run can answer as --answer student"),
     ],
 )
 def test_what_cannot_be_done_is_said(
@@ -326,6 +336,14 @@ def test_what_cannot_be_done_is_said(
     with pytest.raises(SystemExit) as exit_info:
         play(file, [run.format(**paths) for run in runs], ["0"], *more)
     assert exit_info.value.code == 2 and message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("text", ["{}", "[1]", "3", "{"])
+def test_another_file_is_no_table(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "other.json").write_text(text)
+    with pytest.raises(SystemExit) as exit_info:
+        over_delays.main(["--json", str(tmp_path / "other.json")])
+    assert exit_info.value.code == 2 and "other.json is no file of over-delays" in capsys.readouterr().err
 
 
 def test_runs_of_two_tasks_are_refused(sadr: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

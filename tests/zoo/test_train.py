@@ -18,9 +18,11 @@ import yaml
 pytest.importorskip("rl_zoo3")
 
 from kill import Killed
+from stable_baselines3.common.callbacks import EvalCallback
 from trained_run import NETWORKS, train_here
 
 from sb3_said import SAID, DelayedSAC
+from sb3_said.delays.space import ages_of
 from sb3_said.files.archive import load_tree
 from sb3_said.files.checkpoint import TrainingCheckpointCallback
 from sb3_said.zoo import manager, train
@@ -167,6 +169,18 @@ def test_a_resume_keeps_what_it_is_not_told_to_change(tmp_path: Path) -> None:
     assert Record.read(run).options["n_timesteps"] == 80
 
 
+def test_a_resume_takes_no_setting_that_the_run_never_had(tmp_path: Path) -> None:
+    """The YAML of a start is not kept, and a shipped one may have got more since."""
+    own = {"n_timesteps": 60, "policy": "MlpPolicy", "learning_starts": 50}
+    (tmp_path / "own.yml").write_text(yaml.safe_dump({"Hopper-v5": own}))
+    train_here(tmp_path, "--algo stable --env Hopper-v5 --delay 1 --seed 3", "-conf", tmp_path / "own.yml")
+    (run,) = (tmp_path / "stable").iterdir()
+    before = config_of(run)
+    assert "gamma" not in before
+    train.main(["--resume", str(run), "-n", "80", "-params", "tau:0.02"])
+    assert config_of(run) == {**before, "tau": 0.02}
+
+
 def lengths(monitor: Path) -> list[int]:
     """Return the lengths of the episodes in a file of SB3's Monitor."""
     return [int(row.split(",")[1]) for row in monitor.read_text().splitlines()[2:]]
@@ -228,9 +242,19 @@ def test_the_log_path_names_the_delay(delay: Delay, name: str) -> None:
     assert manager.Run(delay, "smoke").name == name
 
 
-def test_the_expert_can_learn_under_another_delay(tmp_path: Path) -> None:
+def test_the_expert_can_learn_under_another_delay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     command = "--algo said --env Pendulum-v1 --delay 0 3 --expert-delay 0 --preset smoke -n 520 --seed 3"
-    train_here(tmp_path, command, "-params", "planner_gradient_steps:5", TINY_PLANNER, NETWORKS)
+    ages: list[int] = []
+
+    def told(model: SAID, like: EvalCallback, *_: Any) -> None:
+        assert like.eval_env is not None
+        ages.extend(ages_of(like.eval_env))
+
+    monkeypatch.setattr(manager, "evaluate_answer", told)
+    monkeypatch.setattr("sb3_said.said.said.let_the_best_answer", None)  # the expert's delay would tell of another
+    params = ["-params", "planner_gradient_steps:5", TINY_PLANNER, NETWORKS]
+    train_here(tmp_path, command, "--eval-freq", "400", *params)
+    assert ages == [0, 1, 2, 3]
     played = load_run(tmp_path / "said" / "Pendulum-v1-delay0-3-expert0-seed3_1", device="cpu")
     assert played.info["delay"] == "EpisodeDelay(low=0, high=3)"
     model = played.model
@@ -253,6 +277,9 @@ def test_the_expert_can_learn_under_another_delay(tmp_path: Path) -> None:
         ("--algo said --expert-delay 0", "--expert-delay needs --algo said"),
         ("--resume {}", "holds no run"),
         ("--algo said --delay 4 -optimize", "with --algo sadr -optimize, and the planner's with sb3-said tune"),
+        ("--env Pendulun-v1", "you maybe meant Pendulum-v1?"),
+        ("-i nowhere.zip", "must be a valid path to a .zip file"),
+        ("--gym-packages not_there", "No module named 'not_there'"),
     ],
 )
 def test_says_what_is_wrong(words: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -321,6 +348,12 @@ def test_the_default_preset_is_the_same_on_every_machine(monkeypatch: pytest.Mon
 def test_training_takes_one_thread_unless_told(given: list[str], n_threads: str) -> None:
     """Two wait for each other beside another process: 3 steps a second in place of 100 (results/settings.md)."""
     assert f"--num-threads={n_threads}" in train.read_command_line(given)[2]
+
+
+def test_a_given_agent_is_found_from_another_folder_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert f"--trained-agent={tmp_path / 'logs' / 'agent.zip'}" in train.read_command_line(["-i", "logs/agent.zip"])[2]
+    assert not any("trained-agent" in word for word in train.read_command_line([])[2])
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,7 @@ from trained_run import ENV, config_of, read_by_train, train_run, train_said
 from sb3_said import SAID, PlannerConfig
 from sb3_said.files.archive import load_tree
 from sb3_said.files.checkpoint import CHECKPOINT_NAME
+from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.zoo import tune
 from sb3_said.zoo.arguments import read_delay
 from sb3_said.zoo.best import plain_settings
@@ -47,6 +48,12 @@ def results_of(run: Path) -> dict[str, Any]:
     return dict(json.loads((run / "tune" / "results.json").read_text()))
 
 
+def settings_of(agent: Path) -> dict[str, Any]:
+    """Return what a search may change of a planner, as an agent has it."""
+    model: Any = load_run(agent, device="cpu").model
+    return {name: getattr(model.policy.planner.config, name) for name in ("depth", *SAMPLING_SETTINGS)}
+
+
 def check_report(run: Path) -> None:
     """The winner is the best trial, and best.zip gives the reported returns again."""
     results, best = results_of(run), load_run(run / "tune" / "best.zip", device="cpu")
@@ -69,6 +76,9 @@ def test_a_search_from_grid_to_report(
     pytest.importorskip("matplotlib")
     grid = ["--depths", "1", "2", "--temperatures", "0", "1", "--sampling-steps", "2", "--prune", "0"]
     command = [str(run), *grid, *QUICK]
+    model: Any = load_run(run, device="cpu").model
+    model.set_planner(choice_factor=3.0)  # as a trial may have found
+    model.save(run / f"{ENV}.zip")
     seeds: list[int] = []
 
     def recorded(self: LoadedRun, n: int, seed: int, *args: Any, original: Any = LoadedRun.play, **kwargs: Any) -> Any:
@@ -97,11 +107,12 @@ def test_a_search_from_grid_to_report(
     assert results_of(run)["report"] == results["report"]
 
     # A training reads the winner.
-    best, winner = run / "tune" / "best.yml", results["winner"]
+    best = run / "tune" / "best.yml"
     assert f"sb3-said train --algo said --env {ENV} --delay 2 -conf {best}" in out
     expected = {**config_of(run), "n_timesteps": 200}
-    expected["planner_kwargs"] |= {name: winner[name] for name in ("depth", "temperature", "sampling_steps")}
+    expected["planner_kwargs"] |= settings_of(run / "tune" / "best.zip")
     assert read_by_train(best, 2, run) == expected
+    assert expected["planner_kwargs"]["choice_factor"] == 3.0  # as the run decides, and so each trial
 
 
 @pytest.mark.parametrize(
@@ -131,8 +142,7 @@ def test_a_search_with_a_drawn_delay_or_vec_normalize(
     assert (load_run(run / "tune" / "best.zip", device="cpu").normalize is not None) == bool(params)
     check_report(run)
     expected = {**config_of(run), "n_timesteps": 200}
-    tried = ("depth", "temperature", "sampling_steps")
-    expected["planner_kwargs"] |= {name: results["winner"][name] for name in tried}
+    expected["planner_kwargs"] |= settings_of(run / "tune" / "best.zip")
     assert read_by_train(run / "tune" / "best.yml", read_delay([str(d) for d in delay]), tmp_path) == expected
     assert f"--delay {' '.join(map(str, delay))} -conf" in capsys.readouterr().out
 
