@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import torch as th
 from measure import progress
-from what_diffusion_buys import make_env, open_run, open_with_log
+from what_diffusion_buys import agent_of, make_env, open_run, open_with_log
 
 from sb3_said import SAID
 from sb3_said.evaluation import collect_observations, confidence_interval, measure_latency, rollout
@@ -65,13 +65,18 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     p.add_argument("--json", type=Path, required=True, help="file of the numbers, read and written")
     args = p.parse_args(argv)
     th.set_num_threads(args.num_threads)
-    rows: dict[str, Any] = json.loads(args.json.read_text()) if args.json.exists() else {}
     model = open_run(args.run) if args.log is None else open_with_log(args.run, args.log)
     model.set_planner(temperature=0.0)
+    settings = {name: getattr(args, name) for name in ("settings", "delays", "episodes", "eval_seed")}
+    settings |= agent_of(model, args)
+    document = json.loads(args.json.read_text()) if args.json.exists() else {"settings": settings, "rows": {}}
+    if (found := document.get("settings")) != settings:
+        p.error(f"{args.json} has rows of {found}, and these would be of {settings}; give another --json.")
+    rows: dict[str, Any] = document["rows"]
     if "planner" not in rows:
         with model.policy.answering("planner"):
             rows["planner"] = play(model, args)
-        write_json(args.json, rows)
+        write_json(args.json, document)
     for seed in args.seeds:
         for q_weight in args.q_weights:
             name = f"student, q_weight {q_weight:g}, seed {seed}"
@@ -80,7 +85,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
                 error = model.distill(q_weight=q_weight, progress_bar=True, **args.settings)
                 with model.policy.answering("student"):
                     rows[name] = play(model, args) | {"error": error}
-                write_json(args.json, rows)
+                write_json(args.json, document)
     show(rows)
     return rows
 

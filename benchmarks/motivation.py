@@ -46,7 +46,7 @@ from sb3_said.offline.belief import (
     belief_error,
     train_belief,
 )
-from sb3_said.zoo.runs import LoadedRun, load_run, origin
+from sb3_said.zoo.runs import LoadedRun, find_agent, load_run, origin
 
 N_WINDOWS = 5_000  # held out, at most
 PLAIN: dict[str, type[LearnedBelief]] = {"rolled out": RolledOutModel, "regressed": RegressedPresent}
@@ -55,13 +55,15 @@ PLAYERS = ["inpainted", "guessed", *PLAIN, "old observation", "SAID", "one step"
 
 
 def load_agent(path: str | Path, device: str = "cpu") -> LoadedRun:
-    """Open a trained agent that reads states as they are.
+    """Open a trained agent that reads states of its task as they are.
 
-    :raises SystemExit: for one that was trained under VecNormalize
+    :raises SystemExit: for one that was trained under VecNormalize, or on a task with arguments or wrappers of its own
     """
-    run = load_run(path, device=device)
+    run, record = load_run(path, device=device), find_agent(Path(path))[1]
     if run.normalize is not None:
         raise SystemExit(f"{path} was trained under VecNormalize, which is not applied here; give another agent.")
+    if record is not None and (record.env_kwargs or record.hyperparams.get("env_wrapper")):
+        raise SystemExit(f"{path} was trained on a task with env_kwargs or env_wrapper, which is not made here.")
     return run
 
 

@@ -55,6 +55,7 @@ def read(path: Path, name: str | None) -> tuple[str, dict[str, dict[int, list[fl
     """Return the task of a file, and its returns by agent and delay.
 
     :param name: of the agent of a file of over-delays
+    :raises ValueError: for such a file of several agents, or of one that answers in several ways
     """
     document = json.loads(path.read_text())
     if "cells" not in document:
@@ -64,7 +65,10 @@ def read(path: Path, name: str | None) -> tuple[str, dict[str, dict[int, list[fl
             if player in NAMES
         }
         return document["env"], rows
-    played = {cell["delay"]: cell["result"]["returns"] for cell in document["cells"] if cell["result"] is not None}
+    cells = [cell for cell in document["cells"] if cell["result"] is not None and not cell.get("age_error")]
+    if len(agents := sorted({(cell["sha256"], str(cell["answer"])) for cell in cells})) > 1:
+        raise ValueError(f"{path} holds {len(agents)} agents or answers, expected those of one agent, in one way.")
+    played = {cell["delay"]: cell["result"]["returns"] for cell in cells}
     return document["env"], {name or path.stem: played}
 
 
@@ -109,7 +113,10 @@ def main(argv: list[str] | None = None) -> dict[tuple[str, str], dict[str, Seeds
         if not path:
             p.error(f"{word} is no SET=JSON, such as medium=hopper-medium-0.json.")
         files.append((kind, name or None, Path(path)))
-    found = table(files)
+    try:
+        found = table(files)
+    except ValueError as error:
+        p.error(str(error))
     show(found)
     for (kind, env), rows in found.items() if args.plot else ():
         returns: dict[str, Any] = {

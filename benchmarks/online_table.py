@@ -40,10 +40,11 @@ Seeds = list[dict[int | str, Cell]]  # for each training seed its cell by delay
 def read(paths: Iterable[Path]) -> dict[str, dict[str, Seeds]]:
     """Return by task and row what each training seed played.
 
-    :raises ValueError: for files of other episodes, or a seed that has no row of SAID
+    :raises ValueError: for files of other episodes, an agent in two files, or one that has no row of SAID
     """
     found: dict[str, dict[str, Seeds]] = {}
     episodes: dict[str, dict[str, object]] = {}
+    files: dict[str, Path] = {}
     for path in paths:
         results = Results(path)
         env = str(results.settings["env"])
@@ -51,6 +52,9 @@ def read(paths: Iterable[Path]) -> dict[str, dict[str, Seeds]]:
             raise ValueError(f"{path} has {results.settings}, and another file of the task {episodes[env]}.")
         cells = [cell for cell in results.cells if cell.result is not None and not cell.age_error]
         for agent in dict.fromkeys(cell.sha256 for cell in cells):
+            if agent in files:
+                raise ValueError(f"{path} and {files[agent]} hold the same agent, which would count as two seeds.")
+            files[agent] = path
             of_agent = [cell for cell in cells if cell.sha256 == agent]
             own = "both" if any(cell.answer == "both" for cell in of_agent) else "planner"
             for row, answer in ((SAID, own), (EXPERT, "expert")):

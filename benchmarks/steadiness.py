@@ -33,7 +33,10 @@ def read_runs(name: str, path: Path) -> list[dict[str, Any]]:
     :raises ValueError: where it holds none
     """
     if path.is_file():
-        return [run for run in json.loads(path.read_text()) if run["name"] == name]
+        runs = json.loads(path.read_text())
+        if found := [run for run in runs if run["name"] == name]:
+            return found
+        raise ValueError(f"{path} has no runs named {name!r}, only {', '.join(sorted({run['name'] for run in runs}))}.")
     files = [file for file in (path / EVALUATIONS, path / "expert" / EVALUATIONS) if file.is_file()]
     if not files:
         raise ValueError(f"{path} has no {EVALUATIONS}; train with --eval-freq.")

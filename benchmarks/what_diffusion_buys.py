@@ -34,6 +34,7 @@ from __future__ import annotations
 
 import argparse
 import copy
+import hashlib
 import json
 from collections.abc import Iterator
 from dataclasses import replace
@@ -45,7 +46,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from measure import progress
-from motivation import GUESS_ALONE, INPAINTING, AllAtOnce, GuessAlone, dict_of
+from motivation import GUESS_ALONE, INPAINTING, AllAtOnce, GuessAlone, dict_of, load_agent
 from tqdm import tqdm
 
 from sb3_said import SAID, DelayedObservationWrapper, PlannerConfig
@@ -58,7 +59,6 @@ from sb3_said.offline.belief import BeliefOnly, PlannerBelief, as_in_a_window
 from sb3_said.planner import InpaintingPlanner
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.said.trial import WAYS
-from sb3_said.zoo.runs import load_run
 
 EXPERT = ("expert, last", "expert, average")
 NETWORKS = ("cloning", "regressed present", "inpainted present", "guessed present", GUESS_ALONE)
@@ -134,9 +134,10 @@ def open_run(folder: Path) -> SAID:
     :raises ValueError: for a folder without a checkpoint or a saved SAID agent
     """
     agents = [*folder.glob("*-v*.zip"), *folder.glob("expert/best_model.zip")]
+    agents = [file for file in agents if not file.name.endswith(".normalize.zip")]
     if not agents or not (folder / CHECKPOINT_NAME).is_file():
         raise ValueError(f"{folder} has no {CHECKPOINT_NAME}, or no saved agent beside it; give a run of --algo said.")
-    run = load_run(agents[0], device="cpu")
+    run = load_agent(agents[0])
     model = run.model
     if not isinstance(model, SAID):
         raise ValueError(f"{folder} is a run of {type(model).__name__}; give one of --algo said.")
@@ -153,13 +154,20 @@ def open_with_log(agent: Path, log: Path) -> SAID:
 
     :raises ValueError: when it is no SAID agent, or the log not of its task
     """
-    run = load_run(agent, device="cpu")
+    run = load_agent(agent)
     if not isinstance(run.model, SAID):
         raise ValueError(f"{agent} is a {type(run.model).__name__}; give a SAID agent.")
     run.model.set_env(run.make_env())
     run.model.take_dataset(log)
     run.model.planner_newest_fraction = 1.0  # no step of a log is newer than another
     return run.model
+
+
+def agent_of(model: SAID, args: argparse.Namespace) -> dict[str, Any]:
+    """Return what tells an agent and its data from others, in JSON types."""
+    weights = [x.numpy(force=True).tobytes() for x in model.actor.state_dict().values()]
+    digest = hashlib.sha256(b"".join(weights)).hexdigest()
+    return {"steps": model.num_timesteps, "actor": digest, "log": None if args.log is None else args.log.name}
 
 
 def make_env(model: SAID, delay: int) -> gym.Env[Any, Any]:
@@ -275,7 +283,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     if preset.mask == "none" and {"inpainted present", INPAINTING} & {*args.rows}:
         p.error(f"This planner inpaints no present: leave 'inpainted present' and {INPAINTING!r} out of --rows.")
     settings: dict[str, Any] = {key: getattr(args, key) for key in ("updates", "episodes", "eval_seed")}
-    settings["steps"] = model.num_timesteps
+    settings |= agent_of(model, args)
     settings |= {f"planner_{name}": value for name, value in preset.to_dict().items()}
     document = json.loads(args.json.read_text()) if args.json.exists() else {**settings, "returns": {}}
     if given := {key: document.get(key) for key in settings if document.get(key) != settings[key]}:

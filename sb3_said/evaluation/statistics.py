@@ -148,7 +148,7 @@ def confidence_interval(
     - ``"Student's t"``, below 10 units: value +- t_{n-1} times the jackknife's standard error, which leaves out one
       unit at a time (Efron and Stein 1981). For the mean it is the usual t interval of the units' means. Of three to
       five normal units a bootstrap interval that is called 95 % covers 73 to 83 %, and jumps from one resample to the
-      next as values change by nothing.
+      next as values change by nothing. It needs a smooth statistic: of a median it covers less than it says.
     - ``"BCa bootstrap"``, from 10 units on, by SciPy. Returns of control tasks are skewed: a few episodes fall far
       below many good ones. BCa corrects for that, and the other two do not.
     - ``"percentile bootstrap"`` where BCa is undefined, because leaving out any one unit changes nothing.

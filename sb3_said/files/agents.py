@@ -161,7 +161,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
             with no_larger_than(saved["parameters"]["policy"]) if own_networks else contextlib.nullcontext():
                 model._setup_model()
             restore_agent(model, saved)
-            model.task = load_metadata(path)["metadata"].get("task")
+            model.task = task_of(load_metadata(path))
             if model.env is not None:
                 model.set_env(model.env)
         if model.use_sde:  # its noise was drawn before the parameters were there
@@ -208,6 +208,15 @@ class SafeSaveMixin(OffPolicyAlgorithm):
     def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:
         """Return the state dicts to take over from those given; an algorithm may keep some of its own."""
         return params
+
+
+def task_of(metadata: dict[str, Any]) -> str | None:
+    """Return the task that an agent's file names; none whose id names a module, which ``gymnasium.make`` would import.
+
+    :param metadata: of the file, as :func:`~sb3_said.files.archive.load_metadata` returns it
+    """
+    task = metadata["metadata"].get("task")
+    return task if isinstance(task, str) and ":" not in task else None
 
 
 class SafePolicyMixin(BasePolicy):

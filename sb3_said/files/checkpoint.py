@@ -22,7 +22,7 @@ from sb3_said.files.normalization import check_statistics, get_statistics, set_s
 
 CHECKPOINT_NAME = "checkpoint.zip"
 _EVALUATION = ("n_calls", "best_mean_reward", "evaluations_timesteps", "evaluations_results", "evaluations_length")
-
+_SUCCESSES = "evaluations_successes"  # of tasks that tell them, and empty for others
 
 SECONDS = 600.0  # of training between two checkpoints, at least
 BYTES_A_SECOND = 500_000  # that checkpoints write at most, over the whole training
@@ -180,7 +180,7 @@ def checksum(model: OffPolicyAlgorithm) -> int:
 def evaluations_of(callback: BaseCallback | None) -> list[dict[str, Any]]:
     """Return the evaluations that each ``EvalCallback`` has made so far."""
     return [
-        {name: np.array(getattr(evaluation, name)).tolist() for name in _EVALUATION}
+        {name: np.array(getattr(evaluation, name)).tolist() for name in (*_EVALUATION, _SUCCESSES)}
         for evaluation in _eval_callbacks(callback)
     ]
 
@@ -202,6 +202,7 @@ def restore_evaluations(callback: BaseCallback | None, saved: list[dict[str, Any
     for eval_callback, kept in zip(eval_callbacks, saved, strict=True):
         for name in _EVALUATION:
             setattr(eval_callback, name, kept[name])
+        eval_callback.evaluations_successes = kept.get(_SUCCESSES, [])
 
 
 def restore_training(model: SafeSaveMixin, path: str | Path, callback: BaseCallback | None = None) -> None:
@@ -286,7 +287,10 @@ def _check_evaluation(saved: dict[str, Any]) -> None:
         raise SavedFileError(f"an evaluation has n_calls {saved['n_calls']!s:.20} and the best mean {best!s:.20}")
     if any(type(rows) is not list or len(rows) != len(results[0]) for rows in results):
         raise SavedFileError("evaluations differ in how many they are")
-    if any(np.asarray(rows).dtype.kind not in "if" for rows in results if rows):
+    successes = saved.get(_SUCCESSES, [])
+    if type(successes) is not list or len(successes) not in (0, len(results[0])):
+        raise SavedFileError("evaluations differ in how many they are")
+    if any(np.asarray(rows).dtype.kind not in "bif" for rows in (*results, successes) if rows):
         raise SavedFileError("evaluations hold more than numbers")
 
 

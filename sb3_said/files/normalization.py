@@ -10,6 +10,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_said.files.archive import SavedFileError, load_tree, readable, save_tree
+from sb3_said.files.checks import check_argument, check_numbers
 
 _SETTINGS = ("norm_obs", "norm_reward", "clip_obs", "clip_reward", "gamma", "epsilon", "norm_obs_keys")
 KIND = "VecNormalize"
@@ -34,7 +35,13 @@ def load_normalization(path: Path, venv: VecEnv, training: bool = False) -> VecN
     """
     saved = load_tree(path, KIND)
     with readable(path, explained=(ValueError, AssertionError)):  # SB3 asserts what it needs
-        vec_normalize = VecNormalize(venv, training, **{name: saved["settings"][name] for name in _SETTINGS})
+        settings = {name: saved["settings"][name] for name in _SETTINGS}
+        check_numbers("settings", settings)
+        for name, value in settings.items():
+            check_argument(name, value, VecNormalize)
+        if min(settings[name] for name in ("epsilon", "clip_obs", "clip_reward")) <= 0:
+            raise ValueError(f"its epsilon and clips are to be above 0: {settings}")
+        vec_normalize = VecNormalize(venv, training, **settings)
         set_statistics(vec_normalize, saved["statistics"])
     return vec_normalize
 

@@ -77,6 +77,7 @@ def _of_columns(name: str, given: Mapping[str, Any]) -> Columns:
     """Return the columns under our names, with the trajectories' ends.
 
     Without next observations, the state after a time limit is unknown: that step's state ends the trajectory instead.
+    The state after a terminal step is unknown, too, and nothing is learned from it; its own stands in its place.
     """
     found = {ours: next((n for n in names if n in given), None) for ours, names in COLUMNS.items()}
     if lacking := [COLUMNS[key] for key in COLUMNS if found[key] is None and key != "next_observations"]:
@@ -92,7 +93,9 @@ def _of_columns(name: str, given: Mapping[str, Any]) -> Columns:
     columns["ends"][-1] = True
     if "next_observations" not in columns:
         states = columns["observations"]
-        columns["next_observations"] = np.concatenate([states[1:], states[-1:]])
+        after = np.concatenate([states[1:], states[-1:]])
+        after[columns["ends"]] = states[columns["ends"]]
+        columns["next_observations"] = after
         unknown = columns["ends"] & ~columns["terminated"]
         columns["ends"] |= np.append(unknown[1:], False)  # where it was the only step, nothing is left of it
         columns = {key: value[~unknown] for key, value in columns.items()}

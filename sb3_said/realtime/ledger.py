@@ -110,20 +110,22 @@ class Ledger:
                 f"The observation has the shape {state.shape} and entries {state}, expected finite numbers of the "
                 f"shape {self.state_space.shape}; drop the reading where a sensor fails."
             )
-        if capture_time is not None and not math.isfinite(capture_time):
-            raise ValueError(f"capture_time is {capture_time}, expected a time; leave it out if it is not known.")
         if capture_time is not None:
+            capture_time = float(capture_time)
+            if not math.isfinite(capture_time):
+                raise ValueError(f"capture_time is {capture_time}, expected a time; leave it out if it is not known.")
             is_repeated = capture_time == self.captured and self.observation is not None
             if is_repeated or capture_time < self.captured or capture_time > latest:
                 return False
         if n_executed is None:
             later = takewhile(lambda effect: effect >= capture_time, reversed(self._effects))  # type: ignore[operator]
             n_executed = self.n_sent - sum(1 for _ in later)
-        elif not 0 <= n_executed <= self.n_sent:
+        elif not (0 <= n_executed <= self.n_sent and n_executed == int(n_executed)):
             raise ValueError(
                 f"The observation says that {n_executed} actions were executed, but {self.n_sent} were sent since "
                 "reset(); reset the robot's count, too, and drop observations of the episode before."
             )
+        n_executed = int(n_executed)  # numbers of a packet are NumPy's, and those of few bits overflow
         if capture_time is not None:
             self.captured = capture_time
         elif n_executed < self._n_shown:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_said.delays.processes import checked_count
 from sb3_said.delays.space import check_spaces, unscale_action
 from sb3_said.realtime.asking import Asking
 from sb3_said.realtime.ledger import Ledger, NoAnswer, Request
@@ -84,8 +85,9 @@ class ControlLoop:
         if not (period > 0 and action_delay >= 0):
             raise ValueError(f"period is {period} and action_delay {action_delay}, expected above 0 and at least 0.")
         counts = {"answer_steps": answer_steps, "max_age": max_age, "hold_steps": hold_steps, "safe_steps": safe_steps}
-        if negative := {name: n for name, n in counts.items() if n is not None and n < 0}:
-            raise ValueError(f"Steps are counted from 0 on, got {negative}.")
+        answer_steps, max_age, hold_steps, safe_steps = (
+            None if n is None else checked_count(name, n, 0) for name, n in counts.items()
+        )
         if max_age is not None and max_age > max_delay:
             raise ValueError(
                 f"max_age is {max_age}, but the model reads ages 0..{max_delay}; train it with a larger max_delay."
@@ -335,7 +337,7 @@ class ControlLoop:
                 asked = self._next_request()
                 if asked is not None:
                     actions, seconds = self._asking.answer(asked)
-                    self._in_flight = asked, actions, self.n_sent + busy_steps(seconds)
+                    self._in_flight = asked, actions, self.n_sent + int(busy_steps(seconds))
 
     def _take(self, request: Request, actions: np.ndarray) -> None:
         """Splice an answer in, unless it is of an episode that has ended."""
@@ -359,12 +361,12 @@ class ControlLoop:
     def _warm_up(self) -> None:
         """Make the first answer take no longer than later ones, and expect it to take as long."""
         seconds = self._asking.warm_up()
-        self._expect(math.ceil(seconds / self.period) if self._simulate is None else self._simulate(seconds))
+        self._expect(math.ceil(seconds / self.period) if self._simulate is None else int(self._simulate(seconds)))
 
 
 def _time(now: float | None) -> float:
     """Return ``now``, which is ``time.monotonic()`` by default."""
-    now = time.monotonic() if now is None else now
+    now = time.monotonic() if now is None else float(now)
     if not math.isfinite(now):
         raise ValueError(f"now is {now}, expected a finite time.")
     return now

@@ -17,6 +17,7 @@ class OnnxModel:
 
     :param path: of the file
     :raises ImportError: without the package onnxruntime
+    :raises ValueError: for a file that is damaged, or of another program
     """
 
     def __init__(self, path: str | os.PathLike[str]):
@@ -26,10 +27,15 @@ class OnnxModel:
             raise ImportError("onnxruntime is missing, which OnnxModel needs: pip install onnxruntime") from error
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
-        self._session = onnxruntime.InferenceSession(os.fspath(path), options, providers=["CPUExecutionProvider"])
+        if not os.path.isfile(path):
+            raise FileNotFoundError(f"{path} does not exist.")
+        try:
+            self._session = onnxruntime.InferenceSession(os.fspath(path), options, providers=["CPUExecutionProvider"])
+            properties = self._session.get_modelmeta().custom_metadata_map
+            low, high = (np.array(json.loads(properties[name]), np.float32) for name in ("action_low", "action_high"))
+        except Exception as error:  # onnxruntime has many kinds
+            raise ValueError(f"{path} is no file of sb3-said export, or damaged ({error}): export it again.") from error
         self._keys = [each.name for each in self._session.get_inputs()]
-        properties = self._session.get_modelmeta().custom_metadata_map
-        low, high = (np.array(json.loads(properties[name]), np.float32) for name in ("action_low", "action_high"))
         self.action_space = spaces.Box(low, high)
         state_space = spaces.Box(-np.inf, np.inf, (self._session.get_inputs()[0].shape[1],), np.float32)
         self.observation_space: spaces.Space[Any] = state_space

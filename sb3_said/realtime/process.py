@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection
+from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,8 @@ class ModelProcess:
     """Loads a model in another process and answers as it does, for a :class:`~sb3_said.realtime.ControlLoop`.
 
     The process imports the script that makes it once more, so what the script does stands below
-    ``if __name__ == "__main__":``. Threads that ask at once are answered one after the other.
+    ``if __name__ == "__main__":``. Threads that ask at once are answered one after the other. A call that is
+    interrupted, as by Ctrl-C, ends the process.
 
     :param load: makes the model; a function that another process can import, such as
         ``functools.partial(SAID.load, "agent.zip", device="cpu")``
@@ -71,9 +73,10 @@ class ModelProcess:
             self._process.join()
 
     def _call(self, *question: Any) -> Any:
+        message = ForkingPickler.dumps(question)
         with self._lock:
             try:
-                self._pipe.send(question)
+                self._pipe.send_bytes(message)
             except OSError as error:
                 raise RuntimeError("The model's process has ended; make another one.") from error
             return self._receive()
@@ -81,7 +84,10 @@ class ModelProcess:
     def _receive(self, hint: str = "") -> Any:
         try:
             answer, failure = self._pipe.recv()
-        except (EOFError, OSError) as error:
+        except BaseException as error:
+            self._pipe.close()  # interrupted: the next question would get what is left of this answer
+            if not isinstance(error, (EOFError, ConnectionError)):
+                raise
             self._process.join(5)
             raise RuntimeError(
                 f"The model's process has ended with exit code {self._process.exitcode}.{hint}"

@@ -134,10 +134,12 @@ def manners_of(cells: Iterable[Cell]) -> Manners | None:
     if not played:
         return None
     returns = [x for result in played for x in result["returns"]]
-    ended = [x for result in played if (x := result.get("terminations")) is not None]
+    ended = [(x, len(result["returns"])) for result in played if (x := result.get("terminations")) is not None]
     changes = [x["value"] for result in played if (x := result.get("mean_action_change"))]
     return Manners(
-        worst_tenth(returns), sum(ended) / len(returns) if ended else None, float(np.mean(changes)) if changes else None
+        worst_tenth(returns),
+        sum(n for n, _ in ended) / sum(n for _, n in ended) if ended else None,
+        float(np.mean(changes)) if changes else None,
     )
 
 

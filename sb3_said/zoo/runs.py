@@ -25,6 +25,7 @@ from sb3_said import DelayedSAC, __version__
 from sb3_said.delays import DelayProcess, FixedDelay
 from sb3_said.delays.space import ages_of, has_state_history
 from sb3_said.evaluation.rollout import Observation, Rollout, rollout
+from sb3_said.files.agents import task_of
 from sb3_said.files.archive import SavedFileError, load_metadata
 from sb3_said.files.normalization import load_normalization, normalization_file
 from sb3_said.said.policies import Answer
@@ -141,17 +142,13 @@ def load_run(
 
 
 def described(file: Path) -> tuple[str | None, str | None]:
-    """Return the algorithm and the task that an agent's file names, as far as it does.
-
-    A task whose id names a module to import (``module:Task-v0``) is not taken from a file.
-    """
+    """Return the algorithm and the task that an agent's file names, as far as it does."""
     try:
         metadata = load_metadata(file)
     except SavedFileError:  # of SB3's own algorithms
         return None, None
     names = [name for name, (kind, _) in ALGORITHMS.items() if kind.__name__ == metadata["kind"]]
-    task = metadata["metadata"].get("task")
-    return (names[0] if len(names) == 1 else None), (task if isinstance(task, str) and ":" not in task else None)
+    return (names[0] if len(names) == 1 else None), task_of(metadata)
 
 
 def find_agent(path: Path) -> tuple[Path, Record | None]:

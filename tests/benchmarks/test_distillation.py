@@ -26,7 +26,7 @@ def test_students_are_played_beside_their_planner(tmp_path: Path, capsys: pytest
              "--onnx", "--json", str(file)]  # fmt: skip
     rows = script.main([*words, "--seeds", "5", "--q-weights", "0.5"])
     name = "student, q_weight 0.5, seed 5"
-    assert set(rows) == {"planner", name} and json.loads(file.read_text()) == rows
+    assert set(rows) == {"planner", name} and json.loads(file.read_text())["rows"] == rows
     assert rows[name]["error"] > 0 and rows[name]["onnx"]["n_calls"] == rows["planner"]["predict"]["n_calls"] == 3
     out = capsys.readouterr().out
     assert f"| {name} | " in out and "| planner | " in out
@@ -40,6 +40,9 @@ def test_students_are_played_beside_their_planner(tmp_path: Path, capsys: pytest
             assert rollout(model, make_env, 2, 10_000, 20).returns.tolist() == rows[row]["returns"]["2"]
 
     assert script.main([*words, "--seeds", "5", "--q-weights", "0.5"]) == rows
+    with pytest.raises(SystemExit):
+        script.main([*words, "--episodes", "3"])
+    assert "has rows of {" in capsys.readouterr().err
 
 
 def test_a_log_takes_the_replays_place(tmp_path: Path) -> None:

@@ -45,7 +45,16 @@ def test_ratio_is_the_median_of_the_turns():
     slow, fast = np.array([2.0, 4.0, 9.0, 8.0, 6.0]), np.array([1.0, 1.0, 3.0, 4.0, 3.0])
     found = measure.ratio(slow, fast)
     assert found.value == 2.0
-    assert found.low <= 2.0 <= found.high
+    assert (found.low, found.high, found.confidence) == (2.0, 4.0, 0.9375)
+    assert np.isnan(measure.ratio(slow[:1], fast[:1]).low)
+
+
+@pytest.mark.parametrize("rounds", [3, 6, 8, 20])
+def test_the_interval_of_a_ratio_covers_its_median(rounds):
+    rng = np.random.default_rng(rounds)
+    found = [measure.ratio(np.exp(rng.normal(size=rounds)), np.ones(rounds)) for _ in range(400)]
+    covered = np.mean([one.low <= 1.0 <= one.high for one in found])
+    assert covered > found[0].confidence - 0.05
 
 
 def test_the_rate_of_products_is_that_of_the_clock(clock, monkeypatch):

@@ -10,6 +10,11 @@ def row(*means):
     return [{"returns": [mean - 1, mean + 1]} for mean in means]
 
 
+def cell(delay, mean, answer=None, sha256="a", age_error=0):
+    result = None if mean is None else {"returns": [mean]}
+    return {"delay": delay, "result": result, "answer": answer, "sha256": sha256, "age_error": age_error}
+
+
 @pytest.fixture
 def files(tmp_path):
     """Two seeds of motivation.py, and an agent of over-delays that has not played delay 8."""
@@ -17,8 +22,7 @@ def files(tmp_path):
         players = {"inpainted": row(500, 50), "old observation": row(1, 2), "SAID": row(*means), "cloning": row(4, 2)}
         document = {"env": "Hopper-v5", "delays": [0, 8], "returns": players}
         (tmp_path / f"{seed}.json").write_text(json.dumps(document))
-    cells = [{"delay": 0, "result": {"returns": [1607.0]}}, {"delay": 8, "result": None}]
-    (tmp_path / "dql.json").write_text(json.dumps({"env": "Hopper-v5", "cells": cells}))
+    (tmp_path / "dql.json").write_text(json.dumps({"env": "Hopper-v5", "cells": [cell(0, 1607.0), cell(8, None)]}))
     return [f"medium={tmp_path}/0.json", f"medium={tmp_path}/1.json", f"medium,DQL+SA={tmp_path}/dql.json"]
 
 
@@ -36,6 +40,17 @@ def test_seeds_are_joined_and_scored(files, tmp_path, capsys):
     assert lines["SAID"][-1] == "84.6, 82.0, 83.5, 86.6 |"
     assert lines["DQL+SA"][2] == "50.0" and lines["DQL+SA"][7] == ""
     assert (tmp_path / "Hopper-v5-medium.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_only_one_agent_that_answers_in_one_way_is_a_row(tmp_path, capsys):
+    file = tmp_path / "agent.json"
+    file.write_text(json.dumps({"env": "Hopper-v5", "cells": [cell(0, 5.0), cell(0, 9.0, age_error=1)]}))
+    assert offline_table.main([f"medium,x={file}"])["medium", "Hopper-v5"]["x"] == {0: [[5.0]]}
+    for other in (cell(0, 7.0, answer="student"), cell(4, 7.0, sha256="b")):
+        file.write_text(json.dumps({"env": "Hopper-v5", "cells": [cell(0, 5.0), other]}))
+        with pytest.raises(SystemExit):
+            offline_table.main([f"medium,x={file}"])
+        assert "holds 2 agents or answers" in capsys.readouterr().err
 
 
 def test_a_word_without_a_file_is_refused(capsys):

@@ -67,6 +67,7 @@ def test_what_cannot_be_compared_is_refused(tmp_path: Path, capsys: pytest.Captu
     for name, cells, settings, said in (
         ("fewer", seed("b", "planner", 1000.0), {"n_episodes": 1}, "another file of the task"),
         ("expert", [cell("b", "expert", 0, 1.0)], {}, "no episodes of planner"),
+        ("again", seed("a", "planner", 1000.0), {}, "hold the same agent"),
     ):
         with pytest.raises(SystemExit):
             online_table.main([first, write(tmp_path / f"{name}.json", cells, **settings)])

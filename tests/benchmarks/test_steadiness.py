@@ -28,6 +28,14 @@ def test_a_row_is_worked_out_by_hand(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert steadiness.main([f"x={file}", f"y={file}", "--last", "30"]) == rows
 
 
+def test_a_name_that_a_file_lacks_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "runs.json"
+    file.write_text('[{"name": "stable", "run": "a", "steps": [1], "returns": [[1.0]]}]')
+    with pytest.raises(SystemExit):
+        steadiness.main([f"stabel={file}"])
+    assert "has no runs named 'stabel', only stable" in capsys.readouterr().err
+
+
 def test_a_run_without_evaluations_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         steadiness.main([f"x={tmp_path}"])

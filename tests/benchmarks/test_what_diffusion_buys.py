@@ -16,7 +16,7 @@ pytest.importorskip("rl_zoo3")
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
 import what_diffusion_buys as script
-from small_run import ENV, TINY_PLANNER
+from small_run import ENV, TINY_PLANNER, write_run
 
 from sb3_said import SAID, DelayedObservationWrapper
 from sb3_said.evaluation import rollout
@@ -123,6 +123,32 @@ def test_other_settings_of_the_planner_need_another_file(run, tmp_path, monkeypa
     with pytest.raises(SystemExit):
         script.main([*other[:-1], "horizon"])
     assert "--planner-kwargs takes NAME=VALUE" in capsys.readouterr().err
+
+
+def test_another_agent_needs_another_file(run, tmp_path, capsys):
+    words = ["--updates", "3", "--delays", "2", "--episodes", "1", "--rows", "expert, average"]
+    words += ["--json", str(tmp_path / "rows.json")]
+    script.main([str(run), *words])
+    other = write_run(tmp_path / "other", SAID, (0, 2), 90, seed=1, checkpoint=True)
+    with pytest.raises(SystemExit):
+        script.main([str(other), *words])
+    assert "holds results of {'actor':" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"env_kwargs": {"reset_noise_scale": 0.1}},
+        {"hyperparams": {"env_wrapper": {"gymnasium.wrappers.TimeLimit": {"max_episode_steps": 50}}}},
+    ],
+)
+def test_a_task_that_is_not_made_here_is_refused(changed, tmp_path):
+    run = write_run(tmp_path / "run", SAID, (0, 2), 90, checkpoint=True)
+    assert script.open_run(run).num_timesteps == 90
+    (run / "a-v5.normalize.zip").touch()  # is no agent
+    replace(Record.read(run), **changed).write(run)
+    with pytest.raises(SystemExit, match="env_kwargs or env_wrapper, which is not made here"):
+        script.load_agent(next(run.glob("*-v*[0-9].zip")))
 
 
 def test_of_a_run_that_has_not_ended_the_checkpoint_counts(run):

@@ -652,3 +652,12 @@ def test_the_file_names_the_task(tmp_path):
     loaded = DelayedSAC.load(tmp_path / "agent.zip", device="cpu")
     loaded.save(tmp_path / "again.zip")  # without an environment
     assert loaded.task == load_metadata(tmp_path / "again.zip")["metadata"]["task"] == "Pendulum-v1"
+
+
+@pytest.mark.parametrize("task", ["module:Task-v0", {"a": 1}, 3])
+def test_a_task_that_would_import_a_module_is_none(task, tmp_path):
+    model = make_sac().learn(20)
+    model.task = task
+    model.save(tmp_path / "agent.zip")
+    assert load_metadata(tmp_path / "agent.zip")["metadata"] == {"task": task}
+    assert DelayedSAC.load(tmp_path / "agent.zip", device="cpu").task is None

@@ -318,6 +318,24 @@ def test_evaluations_are_found_behind_a_progress_bar(tmp_path):
     assert again[0].evaluations_timesteps == [20, 40]
 
 
+def test_successes_go_on_where_they_were(tmp_path):
+    class Told(gym.Wrapper):
+        def step(self, action):
+            *others, info = super().step(action)
+            return *others, {**info, "is_success": bool(action[0] > 0)}
+
+    def evaluated():
+        return EvalCallback(Monitor(Told(delayed())), eval_freq=20, n_eval_episodes=2, log_path=tmp_path, verbose=0)
+
+    before, after = evaluated(), evaluated()
+    model = make().learn(50, [before, TrainingCheckpointCallback(tmp_path, 30)])
+    restore_training(model, tmp_path / CHECKPOINT_NAME, CallbackList([after, TrainingCheckpointCallback(tmp_path)]))
+    assert after.evaluations_successes == before.evaluations_successes != []
+    model.learn(30, [after], reset_num_timesteps=False)
+    with np.load(tmp_path / "evaluations.npz") as saved:
+        assert saved["successes"].shape == (len(saved["timesteps"]), 2) == (4, 2)
+
+
 # ---------------------------------------------------------------------------------------------------- misfits
 
 
@@ -395,6 +413,8 @@ def forgeable(tmp_path_factory):
         (("evaluations", 0, "best_mean_reward"), float("nan")),
         (("evaluations", 0, "evaluations_results"), [["a"]]),
         (("evaluations", 0, "evaluations_timesteps"), [1, 2, 3]),
+        (("evaluations", 0, "evaluations_successes"), [[True]] * 9),
+        (("evaluations", 0, "evaluations_successes"), "a"),
         (("random", "python", 2), float("nan")),
         (("random", "python", 2), "a"),
         (("random", "numpy", 4), float("inf")),

@@ -84,6 +84,7 @@ def test_without_next_observations_a_time_limit_costs_its_last_step(log, tmp_pat
     data = load(write(tmp_path / "log.npz", log))
     assert data.lengths.tolist() == [5, 6] and data.terminated.nonzero()[0].tolist() == [4]
     np.testing.assert_array_equal(data.finals[1], log["observations"][12])  # its own last state ends it
+    np.testing.assert_array_equal(data.finals[0], log["observations"][4])  # what followed the terminal step is unknown
     np.testing.assert_array_equal(data.states, np.delete(log["observations"], [5, 12], axis=0))
 
 

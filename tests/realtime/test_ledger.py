@@ -43,6 +43,18 @@ def test_the_age_counts_actions_that_took_effect_at_the_capture_or_later():
     assert ledger.age == 1
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.float64, np.int64])
+def test_numbers_of_a_packet_are_read_whatever_their_type(dtype):
+    ledger = make()
+    send(ledger, 300)
+    assert ledger.observe([1.0], None, dtype(255 if dtype == np.uint8 else 260))
+    assert ledger.age in (45, 40) and type(ledger.age) is int
+    send(ledger)
+    assert ledger.age in (46, 41)
+    with pytest.raises(ValueError, match=r"2\.5 actions were executed"):
+        ledger.observe([1.0], None, 2.5)
+
+
 def test_a_frozen_sensor_ages_and_an_overtaken_packet_is_dropped():
     ledger = make()
     assert ledger.observe([1.0], 0, None)

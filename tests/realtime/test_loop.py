@@ -286,7 +286,8 @@ def test_statistics_go_to_tensorboard(tmp_path):
     [
         ({"period": 0}, "period is 0"),
         ({"max_age": 5}, r"max_age is 5, but the model reads ages 0..4"),
-        ({"hold_steps": -1}, "hold_steps"),
+        ({"hold_steps": -1}, "hold_steps is a whole number >= 0, got -1"),
+        ({"answer_steps": 1.5}, "answer_steps is a whole number >= 0, got 1.5"),
         ({"safe_action": [3.0]}, "safe_action is"),
         ({"safe_action": [0.0, 0.0]}, "safe_action is"),
     ],
@@ -294,6 +295,15 @@ def test_statistics_go_to_tensorboard(tmp_path):
 def test_settings_that_do_not_fit_are_refused(kwargs, message):
     with pytest.raises(ValueError, match=message):
         ControlLoop(Recorder(TASK, 4), **{"period": 1, "simulate": lambda seconds: 0, **kwargs})
+
+
+def test_numpys_numbers_of_a_log_are_counted_as_pythons():
+    loop = ControlLoop(Recorder(TASK, 4), 0.02, answer_steps=np.int64(1), simulate=lambda seconds: np.int64(3))
+    for k, now in enumerate(np.arange(8) * 0.05):
+        loop.observe(ZEROS, n_executed=np.uint32(k))
+        loop.act(now)
+    found = loop.statistics().to_dict()
+    assert found["overruns"] == 7 and found["late_answers"] > 0 and found["steps"] == 8
 
 
 def test_stamps_of_another_clock_are_refused():

@@ -118,6 +118,24 @@ def test_a_model_in_a_process_answers_as_here():
             model.predict(observations)
 
 
+def test_after_an_interruption_no_question_gets_the_answer_to_another():
+    with ModelProcess(partial(Sum, 0.5)) as model:
+        receive = model._pipe.recv
+
+        def interrupted():
+            receive()
+            raise KeyboardInterrupt
+
+        class Pipe:
+            recv, send_bytes, close = staticmethod(interrupted), model._pipe.send_bytes, model._pipe.close
+
+        model._pipe = Pipe()
+        with pytest.raises(KeyboardInterrupt):
+            model.predict(np.zeros((1, 4)))
+        with pytest.raises(RuntimeError, match="has ended; make another one"):
+            model.predict(np.zeros((1, 4)))
+
+
 @pytest.mark.parametrize("where", ["here", "in a process"])
 def test_the_first_answer_is_not_what_later_ones_are_expected_to_take(where):
     with ExitStack() as stack:

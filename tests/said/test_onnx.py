@@ -13,7 +13,7 @@ from stable_baselines3.common.utils import set_random_seed
 from sb3_said.realtime import OnnxModel
 from sb3_said.said.export import export
 
-pytest.importorskip("onnx")
+onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
 
 
@@ -54,6 +54,21 @@ def test_an_answer_that_is_not_finite_is_refused(tmp_path):
     obs["observation"][3] = np.nan
     with pytest.raises(ValueError, match="not finite; look at the observation"):
         OnnxModel(tmp_path / "agent.onnx").predict(obs)
+
+
+def test_a_file_of_another_program_is_told(tmp_path):
+    model = make()
+    model.policy.make_student(16)
+    export(model.policy, tmp_path / "agent.onnx")
+    graph = onnx.load(tmp_path / "agent.onnx")
+    del graph.metadata_props[:]
+    onnx.save(graph, tmp_path / "other.onnx")
+    (tmp_path / "damaged.onnx").write_bytes(b"nonsense")
+    for name in ("other", "damaged"):
+        with pytest.raises(ValueError, match=rf"{name}.onnx is no file of sb3-said export, or damaged"):
+            OnnxModel(tmp_path / f"{name}.onnx")
+    with pytest.raises(FileNotFoundError, match="does not exist"):
+        OnnxModel(tmp_path / "nowhere.onnx")
 
 
 def test_a_loop_runs_it_without_pytorch(tmp_path):

@@ -21,7 +21,7 @@ from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.evaluation import Summary
 from sb3_said.offline.scores import REFERENCE_RETURNS
 from sb3_said.zoo import evaluate, over_delays
-from sb3_said.zoo.cells import Cell, average, print_scores
+from sb3_said.zoo.cells import Cell, average, manners_of, print_scores
 from sb3_said.zoo.record import Record
 from sb3_said.zoo.runs import load_run
 
@@ -306,6 +306,16 @@ def test_scores_are_the_returns_between_those_of_a_random_policy_and_an_expert(
     assert [cell.strip() for cell in cells[1:4]] == ["said", f"40.0 [{t.low:.1f}, {t.high:.1f}]", "-"]
     print_scores({"said": {0: returns}}, [0, 4], "Pendulum-v1")
     assert not capsys.readouterr().out
+
+
+def test_falls_are_a_part_of_the_episodes_that_counted_them() -> None:
+    old = {"returns": [1.0, 2.0, 3.0]}
+    cells = [
+        Cell("a", None, d, "sadr", "a.zip", "a", 1, None, result=result)
+        for d, result in enumerate([old, {**old, "terminations": 1}])
+    ]
+    found = manners_of(cells)
+    assert found is not None and found.ended == pytest.approx(1 / 3) and found.worst_tenth == 1.0
 
 
 def test_an_average_pairs_training_seeds_where_all_delays_have_as_many() -> None:
