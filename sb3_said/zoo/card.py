@@ -182,7 +182,7 @@ def who_answers(model: Any) -> str:
     if who not in ("planner", "both"):
         return who
     if config.decided_by == "actor":
-        how = "'s guess of the present, on which the expert acts"
+        how = "'s guess of the present, at which the expert's actor decides"
     else:
         how = f" in {config.sampling_steps} denoising step{'s' * (config.sampling_steps > 1)}"
         how += f" at temperature {config.temperature:g}"
