@@ -16,7 +16,7 @@ SAMPLING_SETTINGS = (
     "sampling_steps", "n_candidates", "temperature", "scored_states", "choice_factor", "present", "decided_by"
 )  # fmt: skip
 CHOICES: dict[str, tuple[str, ...]] = {
-    "first_guess": ("prior", "plain", "none"),
+    "first_guess": ("prior", "none"),
     "prediction": PREDICTIONS,
     "schedule": SCHEDULES,
     "time_sampling": TIME_SAMPLINGS,
@@ -50,8 +50,7 @@ class PlannerConfig:
     embed_known: bool = True  # measured: buys as much accuracy as doubling the depth
     # What plain networks make of what is known: the states since by a model of one step, and a clone's action. "prior":
     # the network predicts what this guess does not, so that a planner begins as good as it (measured on logs and on an
-    # expert's replay, results/nine_logs.md and results/what_diffusion_buys.md). "plain": the guess of a weaker model is
-    # shown to the network, and no more. "none" is the paper's
+    # expert's replay, results/nine_logs.md and results/what_diffusion_buys.md). "none" is the paper's
     first_guess: str = "prior"
     # Diffusion
     prediction: str = "v"  # measured: safe with few steps; or "epsilon" (paper)

@@ -30,13 +30,11 @@ class FirstGuess(nn.Module):
     knows nothing of them. That is the planner's to mend: it is shown the guess, and not bound to it.
 
     States are z-scored, actions in [-1, 1].
-
-    :param is_residual: whether the model has residual blocks, or plain layers
     """
 
-    def __init__(self, obs_dim: int, act_dim: int, is_residual: bool = True) -> None:
+    def __init__(self, obs_dim: int, act_dim: int) -> None:
         super().__init__()
-        self.model = OneStepModel(obs_dim, act_dim, is_residual)
+        self.model = OneStepModel(obs_dim, act_dim)
         self.clone = plain_network(obs_dim, act_dim, CLONE_WIDTH)
 
     @th.no_grad()

@@ -69,12 +69,11 @@ class InpaintingPlanner(nn.Module):
             config.depth,
             config.embed_known,
             config.extra_state_probability > 0,
-            config.first_guess != "none",
+            config.first_guess == "prior",
         )
         self.first_guess = self.prior = None
-        if config.first_guess != "none":
-            self.first_guess = FirstGuess(obs_dim, act_dim, config.first_guess == "prior")
         if config.first_guess == "prior":
+            self.first_guess = FirstGuess(obs_dim, act_dim)
             self.prior = Prior(max_delay, self.window_length, obs_dim + act_dim)
         self.normalizer = Normalizer(
             obs_dim, act_dim, self.window_length, config.action_transform, config.relative_states

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch as th
@@ -122,16 +120,7 @@ def test_the_loss_is_of_the_whole_prediction(prediction: str):
 
     alpha, sigma = th.cos(th.pi / 2 * network.t)[:, None, None], th.sin(th.pi / 2 * network.t)[:, None, None]
     best, off = gaussian_prediction(network.x, *seen[0], alpha, sigma, prediction)
-    without = make_planner(prediction=prediction, first_guess="plain")
+    without = make_planner(prediction=prediction, first_guess="none")
     without.normalizer.load_state_dict(planner.normalizer.state_dict())
     without.network = FakeNetwork(best + off * output)
     th.testing.assert_close(loss, without.loss(windows, delay, generator=seeded()), atol=1e-5, rtol=1e-5)
-
-
-def test_files_from_before_there_was_a_prior_have_none():
-    planner = make_planner(first_guess="plain")
-    assert planner.prior is None
-    new = make_planner(first_guess="prior")
-    added = {name for name in set(new.state_dict()) - set(planner.state_dict()) if not name.startswith("first_guess.")}
-    assert added == {"prior.slope", "prior.std"}  # but for the better model of the guess
-    assert dataclasses.replace(new.config, first_guess="plain") == planner.config

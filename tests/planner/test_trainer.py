@@ -104,7 +104,7 @@ OTHER_SETTINGS = {
     "d_model": 64,
     "horizon": 4,
     "embed_known": False,
-    "first_guess": "plain",
+    "first_guess": "prior",
     "prediction": "epsilon",
     "schedule": "linear",
     "time_sampling": "uniform",
@@ -163,7 +163,7 @@ def planned():
 # "decided_by" is an agent's: whose actor decides, it asks for no plan (tests/said/test_policies.py)
 @pytest.mark.parametrize("name", sorted({field.name for field in dataclasses.fields(PlannerConfig)} - {"decided_by"}))
 def test_every_setting_matters(name, planned):
-    needs = {"first_guess": OTHER_SETTINGS["first_guess"], "present": "inpainted"} if name == "present" else {}
+    needs = {"first_guess": "prior", "present": "inpainted"} if name == "present" else {}
     usual = train_and_plan(**needs) if needs else planned
     assert not np.array_equal(usual, train_and_plan(**{**needs, name: OTHER_SETTINGS[name]}))
 

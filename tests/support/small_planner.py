@@ -17,7 +17,6 @@ SMALL = PlannerConfig(
     n_candidates=5,
     temperature=0.5,
     scored_states="future",
-    first_guess="plain",
     present="inpainted",
 )
 LENGTH = DELAY + SMALL.horizon
