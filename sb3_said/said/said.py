@@ -98,7 +98,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         counts = {"gradient_steps": planner_gradient_steps, "train_freq": planner_train_freq}
         for name, count in {**counts, "trial_episodes": planner_trial_episodes}.items():
             least = 0 if name == "trial_episodes" else 1
-            if count is not None and (count < least or count != int(count)):
+            if count is not None and (count < least or count % 1 != 0):
                 raise ValueError(f"planner_{name} must be a whole number, at least {least}, got {count}.")
         if not 0.0 < planner_newest_fraction <= 1.0:
             raise ValueError(
@@ -407,8 +407,8 @@ class SAID(OfflineAlgorithm, StableSAC):
         :raises ValueError: as ``load_dataset`` and :meth:`train_planner` do
         """
         total = self.planner_gradient_steps if gradient_steps is None else gradient_steps
-        watcher = self._begin_offline(dataset, total, callback, tb_log_name, True, progress_bar)
         self.planner_ways = ways_of(self.planner_ways, self.planner_kwargs, "iql")
+        watcher = self._begin_offline(dataset, total, callback, tb_log_name, True, progress_bar)
         self.value, self.planner_newest_fraction = "iql", 1.0  # no step of a log is newer than another
         self.policy.set_value("iql")
         trainer, values = self.make_planner_trainer(total), self._make_value_trainer()

@@ -150,6 +150,10 @@ def test_settings_that_cannot_be_changed_are_refused(saved, given, message):
         ({"planner_kwargs": {"horizon": 1}}, "horizon is 1"),
         ({"planner_gradient_steps": 0}, "planner_gradient_steps must be a whole number, at least 1, got 0"),
         ({"planner_gradient_steps": 2.5}, "planner_gradient_steps must be a whole number, at least 1, got 2.5"),
+        (
+            {"planner_gradient_steps": float("inf")},
+            "planner_gradient_steps must be a whole number, at least 1, got inf",
+        ),
         ({"planner_train_freq": 0}, "planner_train_freq must be a whole number, at least 1, got 0"),
         ({"planner_trial_episodes": -1}, "planner_trial_episodes must be a whole number, at least 0, got -1"),
         ({"planner_newest_fraction": 0.0}, r"in \(0, 1\], got 0"),
