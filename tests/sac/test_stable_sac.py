@@ -127,6 +127,7 @@ def test_one_update_is_that_of_the_formulas():
     model.policy.state_normalizer.fit(th.randn(100, 2) * 3, 10**9)  # not looked at again
     model.policy.return_scale.update(np.full(50, 40.0))
     batch, scale = model.replay_buffer.sample(16), model.policy.return_scale.value
+    batch = batch._replace(dones=(th.arange(16) % 2).float()[:, None])  # what follows an end is worth nothing
     model.replay_buffer.sample = lambda *_, **__: batch
     critic, actor = model.critic, model.actor
     before = [parameter.clone() for parameter in actor.parameters()]
@@ -147,7 +148,16 @@ def test_one_update_is_that_of_the_formulas():
     assert all(map(th.equal, before, actor.parameters()))  # its turn is the next
 
     assert model.log_ent_coef.exp().item() == pytest.approx(0.01)
+    critic.optimizer.step = lambda: None  # what the actor is to see of the critics is known
+    th.manual_seed(2)
+    actor.action_log_prob(batch.next_observations)  # of the target, as before
+    actions, log_prob = actor.action_log_prob(batch.observations)
+    loss = (0.01 * log_prob - th.min(*critic(batch.observations, actions)).squeeze(1)).mean()
+    expected = th.autograd.grad(loss, list(actor.parameters()))
+    th.manual_seed(2)
     model.train(1, 16)
+    for parameter, gradient in zip(actor.parameters(), expected, strict=True):
+        th.testing.assert_close(parameter.grad, gradient)
     assert not any(map(th.equal, before, actor.parameters()))
     assert model.log_ent_coef.exp().item() != pytest.approx(0.01, rel=1e-6)
 
