@@ -148,6 +148,11 @@ def test_values_read_states_as_vec_normalize_leaves_them():
     np.testing.assert_allclose(model.policy.values.mean, normalized.mean(0), atol=1e-5)
 
 
+def test_v_has_the_agents_discount_and_seed():
+    values = [learn(make(gamma=gamma, seed=seed))._make_value_trainer() for gamma, seed in ((0.5, 0), (0.9, 4))]
+    assert [(trainer.gamma, trainer.generator.initial_seed()) for trainer in values] == [(0.5, 0), (0.9, 4)]
+
+
 def test_callbacks_follow_each_update_meet_a_young_planner_and_can_end_it(monkeypatch):
     monkeypatch.setattr("sb3_said.said.said.HAND_OVER_INTERVAL", 2)
     seen = []

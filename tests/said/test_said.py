@@ -424,3 +424,19 @@ def test_what_an_end_is_worth(penalty):
     assert 2 < at_ends.sum() < len(source) / 2
     np.testing.assert_array_equal(source.values[at_ends], 0.0 if penalty == -100.0 else source.values[at_ends].max())
     assert (source.values[at_ends].mean() > source.values[~at_ends].mean()) == (penalty is None)
+
+
+def test_windows_weigh_what_rewards_and_critics_add_up_to():
+    """Drift pays 1 a step and cuts its episodes off at step 12, from where the critics know how it goes on."""
+    model = make(gamma=0.9, seed=3, planner_kwargs={"value_scale": "range"}).learn(60)
+    buffer, trainer = model.replay_buffer, model.make_planner_trainer()
+    source = trainer.source
+    states, actions = (th.from_numpy(part[:60, 0]) for part in (buffer.observations, buffer.actions))
+    with th.no_grad():
+        bootstrapped = model.policy.q_value(states, actions).numpy()
+    expected = np.zeros(60)
+    for k in reversed(range(60)):
+        expected[k] = bootstrapped[k] if k % 12 == 11 else 1.0 + 0.9 * expected[k + 1]
+    expected = expected[source.rows]
+    np.testing.assert_allclose(source.values, (expected - expected.min()) / np.ptp(expected), atol=1e-5)
+    assert trainer.generator.initial_seed() == 3

@@ -11,6 +11,7 @@ from small_task import Drift, delayed
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.vec_env import VecNormalize
+from torch.nn import functional as F
 
 from sb3_said import SAID
 from sb3_said.delays.space import delayed_space
@@ -60,6 +61,7 @@ def test_it_answers_as_the_planner_and_an_untaught_one_does_not(taught):
     error, spread = np.abs(found - wanted).max(), np.abs(wanted - wanted.mean(0)).max()
     assert spread > 0.2 and error < 0.15 * spread < np.abs(2 * untaught.detach().numpy() - wanted).max()
     assert 0 < taught.error < 0.15
+    assert not any(parameter.requires_grad for parameter in taught.policy.student.parameters())
 
 
 @given(seed=st.integers(0, 2**31), max_delay=st.integers(0, 5), is_delayed=st.booleans())
@@ -79,6 +81,45 @@ def test_it_reacts_in_numpy_as_it_learned_in_torch(seed: int, max_delay: int, is
     student.fit(student.read(obs) + th.randn(9, 1, generator=generator))
     arrays = {key: x.numpy() for key, x in (obs if isinstance(obs, dict) else {"observation": obs}).items()}
     th.testing.assert_close(th.from_numpy(student.react(arrays)), student(obs), atol=1e-6, rtol=1e-5)
+
+
+def test_what_never_changes_is_read_as_it_is():
+    student = Student(Drift.observation_space, Drift.action_space, 8)
+    student.fit(th.tensor([[3.0, -1.0], [3.0, 1.0]]))
+    assert student.std.tolist() == [1.0, 1.0] and student.mean.tolist() == [3.0, 0.0]
+
+
+def test_its_error_is_over_rows_that_it_did_not_learn_from_and_its_rate_falls_to_0(pupil, monkeypatch):
+    learned_from, rates, loss, made = [], [], student_module._loss, th.optim.Adam
+
+    class Watched(made):
+        def step(self, closure=None):
+            rates.append(self.param_groups[0]["lr"])
+            return super().step(closure)
+
+    def recorded(model, batch, q_weight):
+        learned_from.append(batch.inputs)
+        return loss(model, batch, q_weight)
+
+    monkeypatch.setattr(student_module, "_loss", recorded)
+    monkeypatch.setattr(th.optim, "Adam", Watched)
+    pupil.planner_newest_fraction = 0.5  # of 60 steps
+    try:
+        error = pupil.distill(**{**QUICK, "own_steps": 0, "gradient_steps": 100}, learning_rate=0.01)
+        generator = th.Generator().manual_seed(pupil.seed)
+        parts = [student_module._replayed(pupil, Distillation(), generator) for _ in range(2)]
+    finally:
+        pupil.planner_newest_fraction = 1.0
+    inputs, labels = (th.cat([getattr(part, name) for part in parts])[:700] for name in ("inputs", "labels"))
+    newest = pupil.replay_buffer.observations[30:60, 0]
+    assert {tuple(x) for x in inputs[:, :2].tolist()} <= {tuple(x) for x in newest.tolist()}
+    student = pupil.policy.student
+    th.testing.assert_close(student.mean, inputs[35:].mean(0))
+    with th.no_grad():
+        assert error == pytest.approx((student.answer(inputs[:35]) - labels[:35]).square().mean().sqrt().item())
+    drawn = th.randint(665, (64,), generator=generator)  # of the first batch
+    assert th.equal(learned_from[0], inputs[35:][drawn])
+    np.testing.assert_allclose(rates, 0.01 * (1 - np.arange(100) / 100), atol=1e-9)
 
 
 def test_the_labels_are_the_planners_at_temperature_0_at_every_age(taught, monkeypatch):
@@ -172,6 +213,16 @@ def test_the_critics_can_have_a_say(pupil):
 
     (plain_q, plain_error), (q, error) = taught_by(0.0), taught_by(0.5)
     assert q > plain_q and error > plain_error
+
+
+def test_their_say_is_in_mean_sizes_of_q(taught):
+    rows = student_module._replayed(taught, Distillation(), th.Generator().manual_seed(1))
+    unknown = student_module._Rows(rows.inputs[:9], rows.labels[:9], th.full_like(rows.presents[:9], th.nan))
+    answers = taught.policy.student.answer(rows.inputs)
+    q = taught.policy.q_value(rows.presents, answers)
+    errors = [F.mse_loss(answers, rows.labels), F.mse_loss(answers[:9], rows.labels[:9])]
+    th.testing.assert_close(student_module._loss(taught, rows, 0.3), errors[0] - 0.3 * q.mean() / q.abs().mean())
+    th.testing.assert_close(student_module._loss(taught, unknown, 0.3), errors[1])
 
 
 @pytest.mark.parametrize("normalized", [False, True])

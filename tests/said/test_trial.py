@@ -63,6 +63,20 @@ def test_an_expert_that_has_not_learned_without_delay_acts_on_no_guess():
     assert list(trial.play_trial(model, n_episodes=1).returns) == ["planner", "expert"]
 
 
+def test_without_delay_the_actor_is_the_expert_and_not_tried_twice():
+    model = make(env=pendulum(delay=0), planner_ways={"actor": trial.WAYS["actor"]}).learn(60)
+    assert model.trained_ages == [0]
+    assert list(trial.play_trial(model, n_episodes=1).returns) == ["planner", "expert"]
+
+
+def test_who_falls_at_once_does_not_tell_an_episodes_age(trained, monkeypatch):
+    """The planner ends its second episode before an observation is 2 steps old."""
+    ages = iter([[0.0, 1.0], [0.0, 2.0], [0.0, 1.0]])
+    monkeypatch.setattr(trained, "planner_ways", {"one_step": trial.WAYS["one_step"]})
+    monkeypatch.setattr(trial, "_play", lambda *_: (np.ones(2), np.array(next(ages)), 1))
+    np.testing.assert_array_equal(trial.play_trial(trained, 2).ages, [0.0, 2.0])
+
+
 def test_the_monitor_file_holds_the_training_and_not_the_trial(tmp_path):
     env = Monitor(pendulum(), str(tmp_path / "0"))
     model = make(env=env, planner_trial_episodes=2).learn(60)
