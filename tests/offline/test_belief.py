@@ -96,6 +96,24 @@ def test_a_planners_belief_repeats_and_keeps_what_is_known():
     assert th.equal(guessed[0], state[0]) and (guessed[delay > 0] - present[delay > 0]).abs().min(1).values.max() > 1e-3
 
 
+def test_an_entry_that_never_moves_stays_finite():
+    belief = RolledOutModel(2, 1, DELAY)
+    belief.fit_scale(th.stack([th.arange(9.0), th.full((9,), 4.0)], dim=1))
+    assert belief.model.move_std[1] == 1.0 and belief.model.move_std[0] > 0
+    assert belief.present(th.tensor([[3.0, 4.0]]), th.zeros(1, DELAY, 1), th.tensor([DELAY])).isfinite().all()
+
+
+def test_an_error_is_in_deviations_of_states_that_are_in_an_episode():
+    """Rows behind an end repeat the last one."""
+    windows = held_out()
+    states, valid = windows.states.clone(), windows.valid.clone()
+    valid[:100, 2:], states[:100, 2:] = False, 1e3
+    spread = states[valid].std(0)
+    expected = (((states[:, 0] - states[:, 2]) / spread) ** 2)[valid[:, 2]].mean().sqrt()
+    found = belief_error(Stale(), windows._replace(states=states, valid=valid), 2)
+    assert found == pytest.approx(expected.item(), rel=1e-5)
+
+
 def test_no_window_reaches_a_delay_that_no_episode_does():
     windows = held_out()
     with pytest.raises(ValueError, match="No window has 4 steps of one episode"):

@@ -274,6 +274,14 @@ def test_a_written_file_names_its_task(log, tmp_path):
         load_dataset(tmp_path / "a.npz", env.observation_space, env.action_space, "Hopper-v5")
 
 
+def test_in_a_written_file_an_end_is_one_of_both_kinds(log, tmp_path):
+    env, data = gym.make("Pendulum-v1"), load(write(tmp_path / "log.npz", log))
+    write_dataset(replace(data, actions=data.actions[:, :1]), tmp_path / "a.npz", env)
+    with np.load(tmp_path / "a.npz") as written:
+        for key in ("terminals", "timeouts"):
+            np.testing.assert_array_equal(written[key], log[key])
+
+
 def test_a_slow_file_shows_a_bar(log, tmp_path, monkeypatch, capsys):
     path = write(tmp_path / "log.npz", log)
     load(path, progress_bar=True)
@@ -309,6 +317,7 @@ def broken(log, key, row, value):
         (lambda log: broken(log, "actions", (2, 0), 2.5), r"Row 2 of .*: the action is outside .*, got \[2.5"),
         (lambda log: broken(log, "actions", (slice(4, 6), 1), -0.5), r"Row 4 .*\(2 rows like this\)"),
         (lambda log: broken(log, "timeouts", 5, False), "Row 5 of .*: its next observation is not that"),
+        (lambda log: broken(log, "next_observations", (1, 2), log["observations"][2, 2] + 0.01), "Row 1 of .*: its nex"),
         (lambda log: log | {"rewards": log["rewards"][:-1]}, "differ in length"),
         (lambda log: log | {"observations": log["observations"][:, :2]}, r"of shape \(2,\), and the task \(3,\)"),
         (lambda log: {k: v for k, v in log.items() if k != "actions"}, "none of actions"),

@@ -145,6 +145,53 @@ def test_eta_makes_it_climb_q():
     assert mean_action(20.0) > mean_action(0.0) + 0.3
 
 
+def ready(**kwargs):
+    model = make(**kwargs)
+    model.take_dataset(demonstrations(5))
+    model.set_logger(configure(format_strings=[]))
+    return model
+
+
+def test_either_critic_is_climbed_in_sizes_of_the_other(monkeypatch):
+    """Q of 2 and -4: it climbs 2 / 4, or -4 / 2."""
+    model, seen = ready(), []
+    monkeypatch.setattr(model.critic, "forward", lambda obs, a: (0 * a + 2.0, 0 * a - 4.0))
+    monkeypatch.setattr(model, "_descend", lambda network, loss: None)
+    monkeypatch.setattr(model.logger, "record_mean", lambda name, value: seen.append((name, round(value, 5))))
+    np.random.seed(0)
+    for _ in range(20):
+        model.train(1, 4)
+    assert {value for name, value in seen if name == "train/q_loss"} == {-2 / 4, 4 / 2}
+
+
+def test_targets_follow_their_networks():
+    """The critics' after each update, the actor's from ``ema_start`` on after every ``ema_every``."""
+    model = ready(tau=0.1, diffusion_kwargs={"ema_start": 3, "ema_every": 2, "ema_decay": 0.7})
+    pairs = {
+        "critic": (model.critic, model.critic_target, [0.1] * 6),
+        "actor": (model.actor, model.policy.actor_target, [0.0, 0.0, 0.0, 0.3, 0.0, 0.3]),
+    }
+    for k in range(6):
+        before = {name: [p.clone() for p in pair[1].parameters()] for name, pair in pairs.items()}
+        model.train(1, 8)
+        for name, (network, target, rates) in pairs.items():
+            for own, old, new in zip(network.parameters(), before[name], target.parameters(), strict=True):
+                th.testing.assert_close(new, old + rates[k] * (own - old))
+
+
+@pytest.mark.parametrize("max_grad_norm", [1e-3, None])
+def test_long_gradients_are_clipped(max_grad_norm):
+    model, norms = ready(diffusion_kwargs={"max_grad_norm": max_grad_norm}), []
+    for network in (model.actor, model.critic):
+        network.optimizer.register_step_pre_hook(
+            lambda given, *_: norms.extend(
+                th.stack([p.grad.norm() for p in group["params"]]).norm().item() for group in given.param_groups
+            )
+        )
+    model.train(1, 8)
+    assert len(norms) == 2 and all((norm <= 1.001e-3) == (max_grad_norm is not None) for norm in norms)
+
+
 @pytest.mark.parametrize("lr_decay", [False, True])
 def test_the_rate_falls_to_0_by_a_cosine(lr_decay, monkeypatch, tmp_path):
     rates = []

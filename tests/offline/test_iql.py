@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.stats import expectile as scipy_expectile
 
 from sb3_said.offline import IQL, Dataset, ImplicitValues, IQLConfig
-from sb3_said.offline.iql import expectile_loss
+from sb3_said.offline.iql import Transitions, expectile_loss
 
 
 @settings(max_examples=30, deadline=None)
@@ -47,6 +47,42 @@ def test_a_bandit_has_the_expectile_of_its_arms_as_value(tau):
     with th.no_grad():
         assert values.value(th.zeros(1, 2)).item() == pytest.approx(4 * tau, abs=0.15)
         np.testing.assert_allclose(values.q_value(th.zeros(2, 2), th.tensor(actions).float()), rewards, atol=0.2)
+
+
+def test_losses_are_those_of_the_formulas():
+    """With both critics apart, so that it shows that the smaller one counts, of which networks, and where it ends."""
+    th.manual_seed(0)
+    values = ImplicitValues(3, 1, IQLConfig(hidden=8, expectile=0.8))
+    with th.no_grad():
+        for critics in (values.q, values.q_target):
+            for q, factor in zip(critics, (9.0, -9.0), strict=True):  # neither is the smaller one everywhere
+                q[-1].weight *= factor
+        values.mean += 0.3
+        values.std *= 2.0
+        values.scale *= 0.25
+    batch = Transitions(*(th.randn(20, *shape) for shape in ((3,), (1,), (), (3,))), (th.arange(20) % 3 == 0).float())
+    expected, smaller = {"v_loss": 0.0, "q_loss": 0.0}, set()
+    with th.no_grad():
+        for s, a, r, s_next, ended in zip(*batch, strict=True):
+            z, z_next = ((x - 0.3) / 2 for x in (s, s_next))
+            x = th.cat([z, a])
+            target = [q(x).item() for q in values.q_target]
+            smaller.add(int(np.argmin(target)))
+            u = min(target) - values.v(z).item()
+            expected["v_loss"] += (0.8 if u >= 0 else 0.2) * u**2 / 20
+            y = 0.25 * r.item() + (0.0 if ended else 0.9 * values.v(z_next).item())
+            expected["q_loss"] += sum((q(x).item() - y) ** 2 for q in values.q) / 20
+            assert values.q_value(s, a).item() == pytest.approx(min(q(x).item() for q in values.q) / 0.25, abs=1e-4)
+        losses = values.losses(batch, gamma=0.9)
+    assert smaller == {0, 1}
+    assert {name: loss.item() for name, loss in losses.items()} == pytest.approx(expected, rel=1e-4)
+
+
+def test_rewards_are_scaled_by_the_longest_trajectory_over_the_spread_of_returns():
+    """Trajectories of 2 and 3 steps, which return 5 and 1."""
+    ends = [False, True, False, False, True]
+    data = dataset(np.eye(5), np.zeros((5, 1)), [2.0, 3.0, 0.0, 0.0, 1.0], ends, ends, np.zeros((2, 5)))
+    assert IQL(ImplicitValues(5, 1, IQLConfig(hidden=8)), data, 0.9).values.scale == 3 / 4
 
 
 @pytest.mark.parametrize("terminates", [True, False])

@@ -36,9 +36,13 @@ def make_windows(n: int, seed: int) -> tuple[th.Tensor, th.Tensor, th.Tensor, th
     return states, actions, delay, known
 
 
+@pytest.mark.parametrize("scale", [1.0, 1e4])
 @th.no_grad()
-def test_it_is_a_naive_loop_over_each_window():
+def test_it_is_a_naive_loop_over_each_window(scale: float):
+    """Also where the model runs away, and where the clone wants more than actions can be."""
     guess = make_guess()
+    for network in (guess.model.net[-1], guess.clone[-1]):
+        network.weight *= scale
     states, actions, delay, known = make_windows(20, seed=1)
     made = guess(states, actions, delay, known, longest=D)
     for i, d in enumerate(delay.tolist()):
@@ -53,6 +57,7 @@ def test_it_is_a_naive_loop_over_each_window():
         action = guess.clone(expected[-1]).clamp(-1, 1)
         th.testing.assert_close(made[i, d:, STATE_DIM:], action.expand(L - d, -1))
         assert not made[i, :d, STATE_DIM:].any()
+    assert made.abs().max() <= FARTHEST and made[..., STATE_DIM:].abs().max() <= 1
 
 
 @given(seed=st.integers(0, 2**31))
@@ -95,6 +100,24 @@ def test_it_learns_a_linear_system_and_its_behaviour():
     behaviour = -(states[:, D] @ BEHAVIOUR_GAIN.T).clamp(-1, 1)  # its noise has mean 0, but where it is clipped
     assert (made[:, D, STATE_DIM:] - behaviour).abs().mean() < 0.1
     assert (made[:, D, STATE_DIM:] - behaviour).abs().mean() < 0.3 * behaviour.abs().mean()
+
+
+def test_the_clone_does_what_weighs_more_and_moves_are_the_data_s():
+    """Half of the windows do 0.8 at value 1, the others -0.8 at value 0: at beta 3 the first weigh 20 times as much."""
+    source, generator = make_source(40, 20), th.Generator().manual_seed(0)
+    is_good = source.envs % 2 == 0
+    actions = th.where(th.arange(40) % 2 == 0, 0.8, -0.8)[None, :, None].expand_as(source.actions).clone()
+    source = replace(source, actions=actions, values=is_good.float())
+    normalizer = Normalizer(STATE_DIM, ACTION_DIM, L, relative_states=True)
+    normalizer.fit(source.start_states(), source.start_actions())
+    normalizer.fit_moves(source.sample(1_000, L, generator))
+    guess = make_guess()
+    fit_first_guess(guess, source, normalizer, PlannerConfig(weight_factor=3.0), 300, generator)
+    assert th.equal(guess.model.move_std, normalizer.move_std[0]) and not th.allclose(guess.model.move_std, th.ones(2))
+    with th.no_grad():
+        done = guess.clone(normalizer.normalize_states(source.start_states())).mean()
+    share = 1 / (1 + th.e**-3)
+    th.testing.assert_close(done, th.tensor(0.8 * (2 * share - 1)), atol=0.1, rtol=0)
 
 
 def test_older_steps_teach_the_model_and_not_the_clone():

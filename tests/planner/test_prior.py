@@ -84,6 +84,16 @@ def test_a_planner_that_has_learned_nothing_decides_as_its_guess(trainer: Planne
 
 
 @th.no_grad()
+def test_it_learns_from_steps_of_the_episode_and_of_the_age_s_window_alone(monkeypatch: pytest.MonkeyPatch):
+    planner, windows, fitted = make_planner(first_guess="prior"), make_windows(30), []
+    monkeypatch.setattr(planner.prior, "fit", lambda d, guess, clean, valid: fitted.append((d, valid)))
+    planner.fit_prior(windows)
+    assert [d for d, _ in fitted] == list(range(DELAY + 1))
+    for d, valid in fitted:
+        assert th.equal(valid, windows.valid & (th.arange(LENGTH) < d + planner.config.horizon))
+
+
+@th.no_grad()
 def test_what_the_guess_is_sure_of_is_hardly_moved():
     planner = make_planner(first_guess="prior")
     planner.prior.slope.fill_(1.0)

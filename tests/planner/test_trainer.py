@@ -17,6 +17,7 @@ from sb3_said.planner.diffusion import alpha_sigma, draw_times
 from sb3_said.planner.dit import HEAD_DIM
 from sb3_said.planner.inpainting import draw_delays
 from sb3_said.planner.trainer import (
+    YARDSTICK_LEARNING_RATE,
     PlannerTrainer,
     ema_decay,
     learning_rate,
@@ -170,10 +171,16 @@ def test_every_setting_matters(name, planned):
 
 def test_optimizers_follow_the_schedule():
     trainer = make_trainer(gradient_steps=8, warmup_steps=4, learning_rate=2e-3)
-    rates = []
-    trainer.train(callback=lambda t: rates.append(t.pop_losses()["planner/learning_rate"]))
+    rates, yardsticks = [], []
+
+    def note(trainer):
+        rates.append(trainer.pop_losses()["planner/learning_rate"])
+        yardsticks.append(trainer.yardstick_optimizer.param_groups[0]["lr"])
+
+    trainer.train(callback=note)
     expected = [0.5e-3, 1e-3, 1.5e-3, 2e-3] + [1e-3 * (1 + math.cos(math.pi * k / 4)) for k in range(4)]
     np.testing.assert_allclose(rates, expected)
+    np.testing.assert_allclose(yardsticks, np.array(expected) * YARDSTICK_LEARNING_RATE / 2e-3)
 
 
 def test_planner_holds_the_average_of_the_online_weights():
@@ -425,6 +432,40 @@ def test_evaluation_covers_every_delay(max_delay, mask, delays):
     assert all(len(key) <= 36 for key in metrics)  # longer ones are cut by the logger
     if mask == "random":
         assert metrics["planner/present_error_d0"] < 1e-5  # nothing is hidden there
+
+
+def test_errors_are_of_the_present_and_of_the_action_at_the_decision():
+    trainer = make_trainer()
+    trainer.train(5)
+    trainer.yardstick.requires_grad_(False)
+    metrics, normalizer = trainer.evaluate(), trainer.average.normalizer
+    for d, (states, actions, _, _) in trainer._held_out.items():
+        history = th.zeros(len(states), D, ACTION_DIM)
+        history[:, D - d :] = actions[:, :d]
+        delay = th.full((len(states),), d)
+        plan = trainer.average.plan(states[:, 0], history, delay, temperature=0.0)
+        present, decision = trainer.yardstick(normalizer.normalize_states(states[:, 0]), actions, delay)
+        off = normalizer.normalize_states(plan.present) - normalizer.normalize_states(states[:, d])
+        yardstick_off = present - normalizer.normalize_states(states[:, d])
+        for name, error in (
+            ("present_error", off),
+            ("action_error", plan.action - actions[:, d]),
+            ("present_error_mlp", yardstick_off),
+            ("action_error_mlp", decision.clamp(-1, 1) - actions[:, d]),
+        ):
+            assert metrics[f"planner/{name}_d{d}"] == pytest.approx(error.abs().mean().item(), rel=1e-5)
+
+
+def test_the_regression_meets_every_age_also_where_the_planner_meets_none(monkeypatch):
+    trainer, met = make_trainer(mask="none", first_guess="prior"), []
+    loss = trainer.yardstick.loss
+    monkeypatch.setattr(
+        trainer.yardstick,
+        "loss",
+        lambda windows, delay, weight: met.extend(delay.tolist()) or loss(windows, delay, weight),
+    )
+    trainer.train(3)
+    assert set(met) == set(range(D + 1))
 
 
 def test_evaluation_s_windows_reach_the_decision():
