@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from sb3_said.evaluation import Summary, confidence_interval, plots
+from sb3_said.evaluation.statistics import Interval
 
 PNG = b"\x89PNG"
 
@@ -29,6 +30,10 @@ def write_monitor(folder: Path, rank: int, rows: list[tuple[float, int, float]])
     (folder / f"{rank}.monitor.csv").write_text("\n".join(lines) + "\n")
 
 
+def _bounds(interval: Interval) -> tuple[float, float]:
+    return interval.low, interval.high
+
+
 def test_learning_curve(tmp_path: Path, png: Path) -> None:
     with pytest.raises(ValueError, match="neither"):
         plots.plot_learning_curve(tmp_path)
@@ -40,6 +45,13 @@ def test_learning_curve(tmp_path: Path, png: Path) -> None:
     # Two environments side by side, in episodes of 50 and 20 steps.
     np.testing.assert_array_equal(steps[:6], [40, 80, 100, 120, 160, 200])
     np.testing.assert_array_equal(returns[:6], [-5.0, -5.0, 10.0, -5.0, -5.0, 11.0])
+    mean_steps, means = plots.plot_learning_curve(tmp_path, window=3).lines[1].get_data()
+    np.testing.assert_array_equal(mean_steps, steps[2:])
+    np.testing.assert_allclose(means, [returns[k : k + 3].mean() for k in range(58)])
+    with np.load(tmp_path / "evaluations.npz") as file:
+        intervals = [confidence_interval(row) for row in file["results"]]
+    (band,) = ax.collections[0].get_paths()
+    assert {round(y, 6) for x, y in band.vertices if x == 500} == {round(b, 6) for b in _bounds(intervals[0])}
     plots.save(ax, png)
     assert drawn(png)
 

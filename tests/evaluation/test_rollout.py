@@ -196,6 +196,22 @@ def test_latency_counts_every_call_but_the_warm_up(monkeypatch: pytest.MonkeyPat
         measure_latency(model, observations, n_calls=0)
 
 
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_a_latency_is_of_all_observations_in_turn_and_of_the_draws_asked_for(deterministic: bool) -> None:
+    asked: list[tuple[float, bool]] = []
+
+    class Noting(Model):
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            asked.append((float(observation[0, 0]), deterministic))
+            return super().predict(observation, state, episode_start)
+
+    measure_latency(Noting(), np.arange(6.0).reshape(3, 2), n_calls=7, deterministic=deterministic)
+    assert asked[1:] == [(2.0 * (k % 3), deterministic) for k in range(7)]
+    asked.clear()
+    rollout(Noting(), Countdown, 2, SEED, deterministic=deterministic)
+    assert {drawn for _, drawn in asked} == {deterministic}
+
+
 def test_latency_counts_the_first_call_of_a_model_that_warms_up() -> None:
     class Warm(Model):
         ready = False

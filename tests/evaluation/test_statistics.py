@@ -166,6 +166,16 @@ def test_summary_is_strict_json() -> None:
     assert read["returns"] == [5.0] and read["lengths"] == [7] and read["latency"]["n_calls"] == 1
 
 
+def test_a_summary_has_each_of_its_numbers_from_its_own_column() -> None:
+    returns, lengths, ends = np.arange(30.0), np.arange(30) + 100, np.arange(30) < 4
+    summary = Summary.from_episodes("x", returns, lengths, terminated=ends, action_changes=returns / 100)
+    assert summary.mean_return == confidence_interval(returns)
+    assert summary.mean_length == confidence_interval(lengths)
+    assert summary.mean_action_change == confidence_interval(returns / 100)
+    assert (summary.worst_tenth, summary.terminations) == (1.0, 4)
+    assert Summary.from_episodes("x", returns, lengths).terminations is None
+
+
 def test_the_worst_tenth() -> None:
     assert worst_tenth([5.0]) == 5.0
     assert worst_tenth(np.arange(20.0)[::-1]) == 0.5

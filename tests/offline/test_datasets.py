@@ -317,7 +317,7 @@ def broken(log, key, row, value):
         (lambda log: broken(log, "actions", (2, 0), 2.5), r"Row 2 of .*: the action is outside .*, got \[2.5"),
         (lambda log: broken(log, "actions", (slice(4, 6), 1), -0.5), r"Row 4 .*\(2 rows like this\)"),
         (lambda log: broken(log, "timeouts", 5, False), "Row 5 of .*: its next observation is not that"),
-        (lambda log: broken(log, "next_observations", (1, 2), log["observations"][2, 2] + 0.01), "Row 1 of .*: its nex"),
+        (lambda log: broken(log, "next_observations", (1, 2), log["observations"][2, 2] + 0.01), "Row 1 of .*: its"),
         (lambda log: log | {"rewards": log["rewards"][:-1]}, "differ in length"),
         (lambda log: log | {"observations": log["observations"][:, :2]}, r"of shape \(2,\), and the task \(3,\)"),
         (lambda log: {k: v for k, v in log.items() if k != "actions"}, "none of actions"),

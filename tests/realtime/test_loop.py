@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from recorder import Gated, Planning, Recorder, assert_honest, plan_of
 from small_agent import make
-from small_task import Drift
+from small_task import Drift, delayed
 
-from sb3_said.realtime import ControlLoop, LoopedModel, NoAnswer, ticks
+from sb3_said.delays import UniformDelay
+from sb3_said.evaluation import rollout
+from sb3_said.realtime import ControlLoop, LoopedModel, LoopStatistics, NoAnswer, ticks
 
 TASK = Drift()
 ZEROS = np.zeros(2, np.float32)
@@ -205,6 +207,37 @@ def test_it_expects_what_answers_took(n, expected):
     assert found.waiting_steps == n and found.late_answers == found.held_steps == 0
 
 
+@pytest.mark.parametrize(("n_slow", "expected"), [(4, 1), (6, 3)])
+def test_it_expects_what_19_of_the_last_20_answers_took(n_slow, expected):
+    model, took = Planning(TASK, 8), iter([3] * 100 + [1] * (100 - n_slow) + [3] * n_slow)
+    loop = ControlLoop(model, 1, simulate=lambda seconds: next(took, 1))
+    for t in range(300 + 100 + 2 * n_slow):
+        loop.observe(ZEROS, n_executed=t)
+        loop.act(t)
+    assert loop.answer_steps == expected
+
+
+def test_an_overrun_is_an_action_more_than_half_a_period_late():
+    found = LoopStatistics()
+    for gap in (0.5, 1.0, 1.49, 1.5, 1.51, 7.0):
+        found.count(gap=gap)
+    assert found.overruns == 2
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_a_model_is_asked_for_the_draws_that_the_loop_was_told(deterministic):
+    class Noting(Planning):
+        def predict_plan(self, observation, deterministic=False):
+            noted.append(deterministic)
+            return super().predict_plan(observation)
+
+    noted = []
+    loop = in_steps(Noting(TASK, 4), deterministic=deterministic)
+    loop.observe(ZEROS, n_executed=0)
+    loop.act(0)
+    assert set(noted) == {deterministic}
+
+
 def test_an_answer_later_than_expected_is_spliced_by_what_was_consumed():
     model = Planning(TASK, 8)
     loop = in_steps(model, 2, answer_steps=1)
@@ -334,6 +367,18 @@ def test_ticks_come_once_a_period_and_make_up_for_none():
     assert [next(beat), next(beat)] == [5.5, 6.5]
     with pytest.raises(ValueError, match="period is 0"):
         next(ticks(0))
+
+
+def test_a_looped_model_that_takes_no_time_is_asked_what_it_is_asked_without_a_loop():
+    """In each of two episodes, under ages that its wrapper counts."""
+    alone, looped = Recorder(TASK, 4), Recorder(TASK, 4)
+    loop = in_steps(looped)
+    for model in (alone, LoopedModel(loop)):
+        rollout(model, lambda: delayed(UniformDelay(0, 4)), 2, seed=3)
+    assert len(looped.asked) == len(alone.asked) == 24
+    for ours, theirs in zip(looped.asked, alone.asked, strict=True):
+        for key, value in theirs.items():
+            np.testing.assert_array_equal(ours[key], value)
 
 
 def test_a_looped_model_plays_one_environment():
