@@ -21,6 +21,7 @@ from sb3_said.files.archive import SavedFileError, load_tree, save_tree
 from sb3_said.files.checkpoint import (
     CHECKPOINT_NAME,
     TrainingCheckpointCallback,
+    checksum,
     random_state,
     restore_random_state,
     restore_training,
@@ -131,6 +132,18 @@ def test_a_checkpoint_holds_the_whole_run(tmp_path):
     assert (python, numpy, torch) == (random.random(), np.random.rand(), th.rand(1))
 
 
+@pytest.mark.parametrize("name", ["observations", "actions", "rewards", "dones", "timeouts"])
+def test_any_number_of_a_replay_tells_it_from_another(name):
+    model = make().learn(40)
+    before, column = checksum(model), getattr(model.replay_buffer, name)
+    kept = column[39].copy()
+    column[39] = 1 - kept
+    assert checksum(model) != before
+    column[39] = kept
+    column[40:] = 7  # what is not stored yet
+    assert checksum(model) == before
+
+
 def test_random_states_come_back(tmp_path):
     random.gauss(0, 1)  # Python keeps a second number for the next call
     np.random.normal()  # so does NumPy
@@ -176,6 +189,16 @@ def test_a_resumed_environment_meets_no_episode_of_another_use(tmp_path, n_envs)
         seeds.append(tuple(resumed.env._seeds))
     assert seeds[0] == seeds[1] and len(set(seeds)) == 4
     assert all(2**30 <= seed < 2**32 for each in seeds for seed in each)
+
+
+def test_a_resume_amid_the_random_actions_repeats_none(tmp_path):
+    model = make(learning_starts=90)
+    path = run_and_kill(model, tmp_path)
+    resumed = make(learning_starts=90)
+    restore_training(resumed, path)
+    resumed.learn(30, reset_num_timesteps=False)
+    actions = resumed.replay_buffer.actions[:80].ravel()
+    assert len(np.unique(actions)) == 80
 
 
 def test_a_resume_starts_a_new_episode_in_a_model_that_was_amid_one(tmp_path):

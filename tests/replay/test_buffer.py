@@ -334,6 +334,18 @@ def trained_normalizer(player, rows, **kwargs):
     return env
 
 
+def test_an_episode_s_last_observation_may_be_clipped():
+    """By VecNormalize, whose own statistics bring it back to environment units."""
+    player = Player(delay=3)
+    buffer, ended = make_buffer(player), []
+    for row in player.play(40):
+        for env in np.flatnonzero(row.done):
+            row.next_obs["observation"][env] += 0.5
+            ended.append(env)
+        fill(buffer, [row])
+    assert ended
+
+
 def test_true_states_are_normalised_with_the_statistics_of_observations():
     player = Player(delay=3)
     rows = player.play(40)

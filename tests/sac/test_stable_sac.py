@@ -110,6 +110,34 @@ def test_what_actor_and_critics_read_of_states():
     th.testing.assert_close(actor[:, -1:], batch["delay"] / 3)  # ages and actions as they are
 
 
+def test_states_are_looked_at_where_critics_see_them():
+    model = make(delayed(3), learning_starts=1000).learn(60)
+    sample = model.replay_buffer.sample
+
+    def apart(*args, **kwargs):
+        batch = sample(*args, **kwargs)
+        batch.observations[UNDELAYED] = batch.observations["observation"] + 5.0
+        apart.mean = batch.observations[UNDELAYED].mean(0)
+        return batch
+
+    model.replay_buffer.sample = apart
+    model._look_at_states()
+    th.testing.assert_close(model.policy.state_normalizer.mean, apart.mean)
+
+
+def test_a_new_training_s_returns_begin_with_its_episodes():
+    model = make(Drift(), gamma=0.5, learning_starts=100).learn(3)
+    model.learn(2)  # the episode before was cut off
+    assert model.policy.return_scale.largest == 1 + 0.5 + 0.25
+    assert model._running_returns == 1 + 0.5
+
+
+def test_all_rates_follow_the_schedule():
+    model = make(learning_rate=lambda remaining: 0.01 * remaining).learn(60)
+    optimizers = model.actor.optimizer, model.critic.optimizer, model.ent_coef_optimizer
+    assert [optimizer.param_groups[0]["lr"] for optimizer in optimizers] == pytest.approx([0.0] * 3, abs=1e-9)
+
+
 def test_steps_that_are_counted_anew_have_their_states_looked_at():
     model = make(delayed(3)).learn(200)
     normalizer = model.policy.state_normalizer
@@ -162,6 +190,32 @@ def test_one_update_is_that_of_the_formulas():
     assert model.log_ent_coef.exp().item() != pytest.approx(0.01, rel=1e-6)
 
 
+def test_targets_follow_the_critics_each_interval_and_their_batch_norm_at_once():
+    kwargs = {"policy_kwargs": {"net_arch": [16], "features_extractor_class": Normalized}, "learning_starts": 1000}
+    model = make(Drift(), target_update_interval=3, tau=0.1, **kwargs).learn(40)
+    running = "features_extractor.extractor.norm.running_mean"
+    before = [parameter.clone() for parameter in model.critic_target.parameters()]
+    for k in range(1, 4):
+        model.train(1, 16)
+        own, target = model.critic.state_dict()[running], model.critic_target.state_dict()[running]
+        assert own.abs().min() > 0  # it has learned
+        assert th.equal(own, target) == (k == 3)
+        for old, new, learned in zip(before, model.critic_target.parameters(), model.critic.parameters(), strict=True):
+            th.testing.assert_close(new, old + 0.1 * (learned - old) if k == 3 else old)
+
+
+def test_state_dependent_exploration_is_drawn_anew_for_each_batch_and_answer():
+    model, drawn = make(delayed(2), use_sde=True, learning_starts=1000).learn(30), []
+    reset = model.actor.reset_noise
+    model.actor.reset_noise = lambda *args, **kwargs: drawn.append(0) or reset(*args, **kwargs)
+    model.train(3, 16)
+    assert len(drawn) == 3
+    average = model.policy.averaged_actor.action_dist
+    before = average.exploration_mat.clone()
+    model.policy.reset_noise()
+    assert not th.equal(average.exploration_mat, before)
+
+
 def test_the_actor_is_slower():
     model, changes, before = make(policy_delay=3, learning_starts=1000).learn(40), [], None
     for _ in range(12):
@@ -187,6 +241,7 @@ def test_the_average_of_the_actor(decay):
     kwargs = {"policy_kwargs": {"net_arch": [16], "features_extractor_class": Normalized}, "policy_delay": 1}
     model = make(Drift(), actor_averaging=decay, learning_starts=1000, **kwargs).learn(40)
     average, expected = model.policy.averaged_actor, None
+    th.testing.assert_close(average.state_dict(), model.actor.state_dict())  # before there is anything to average
     for n in range(1, 7):
         model.train(1, 16)
         weights = model.actor.mu.weight.detach().clone()

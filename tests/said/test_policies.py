@@ -516,3 +516,13 @@ def test_both_need_an_age_and_keep_what_each_has_met(saved, tmp_path):
         model.check_ages([max_delay])
     with pytest.raises(ValueError, match="not trained yet"):
         make().set_answer("both", expert_up_to=0)
+
+
+def test_every_age_at_which_the_expert_answers_comes_back_from_its_part():
+    policy = make(delayed((0, 40))).policy
+    policy.planner_updates.fill_(1.0)
+    for age in range(40):
+        policy.set_answer("both", expert_up_to=age)
+        assert policy.expert_ages == range(age + 1)
+        policy.set_answer("both", expert_from=age + 1)
+        assert policy.expert_ages == range(age + 1, 41)
