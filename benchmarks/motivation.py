@@ -46,7 +46,8 @@ from sb3_said.offline.belief import (
     belief_error,
     train_belief,
 )
-from sb3_said.zoo.runs import LoadedRun, find_agent, load_run, origin
+from sb3_said.zoo.folder import find_agent
+from sb3_said.zoo.runs import LoadedRun, load_run, origin
 
 N_WINDOWS = 5_000  # held out, at most
 PLAIN: dict[str, type[LearnedBelief]] = {"rolled out": RolledOutModel, "regressed": RegressedPresent}

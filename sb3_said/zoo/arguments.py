@@ -73,8 +73,11 @@ def check_positive(args: argparse.Namespace, *names: str) -> None:
 
 
 @contextmanager
-def explained(parser: argparse.ArgumentParser) -> Iterator[None]:
-    """Turn errors that a user can mend into a message without a traceback."""
+def explained(parser: argparse.ArgumentParser, goes_on: bool = False) -> Iterator[None]:
+    """Turn errors that a user can mend into a message without a traceback.
+
+    :param goes_on: where it was interrupted, when the same command is given again
+    """
     try:
         yield
     except (ValueError, gym.error.Error) as error:
@@ -82,7 +85,7 @@ def explained(parser: argparse.ArgumentParser) -> Iterator[None]:
     except (ImportError, OSError) as error:
         parser.exit(1, f"{error}\n")
     except KeyboardInterrupt:
-        parser.exit(130, "\nInterrupted. Give the same command again to go on.\n")
+        parser.exit(130, "\nInterrupted." + " Give the same command again to go on." * goes_on + "\n")
 
 
 @contextmanager

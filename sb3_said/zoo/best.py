@@ -34,6 +34,8 @@ def write_best(run: Path, folder: Path, planner: dict[str, Any], choice: str) ->
         shutil.copyfile(statistics, normalization_file(folder / record.agent_name))  # of all agents there
 
     words = ["sb3-said", "train", "--algo", "said", *record.task_words()]
+    if record.eval_env_kwargs != record.env_kwargs:  # which the YAML has
+        words += ["--eval-env-kwargs", *(f"{name}:{value!r}" for name, value in record.eval_env_kwargs.items())]
     command = shlex.join([*words, "-conf", str(folder / "best.yml")])
 
     block, left_out = plain_settings(record)

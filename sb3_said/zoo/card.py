@@ -13,6 +13,7 @@ from huggingface_hub import EvalResult, ModelCard, ModelCardData
 
 from sb3_said import SAID
 from sb3_said.delays.space import written_ages
+from sb3_said.delays.text import age_range
 from sb3_said.zoo.arguments import explained, make_parser
 from sb3_said.zoo.cells import Cell, Results, average
 from sb3_said.zoo.over_delays import digest_of
@@ -55,7 +56,8 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(argv)
     with explained(parser):
         record, results = Record.read(args.run), Results(args.returns, None)
-        card = make_card(load_run(args.agent), record, results, args.latency, trial_steps(args.run))
+        run = load_run(args.agent, record.algo, record.env, gym_packages=record.gym_packages)
+        card = make_card(run, record, results, args.latency, trial_steps(args.run))
     target = args.output or args.agent.with_suffix(".md")
     card.save(target)
     print(f"Wrote {target}")
@@ -132,12 +134,13 @@ def describe(
     kind = type(run.model).__name__
     n_episodes, seed = results.settings["n_episodes"], results.settings["seed"]
     period = control_period(run)
+    steps = "gradient steps, on logs" if record.dataset else "environment steps"
     facts: dict[str, Any] = {
-        "ages trained on": written_ages(run.model.trained_ages or []) + " control steps",  # type: ignore[attr-defined]
+        "ages trained on": written_ages(ages_trained_on(run, record)) + " control steps",
         "largest age it reads": f"{longest_delay(run.model) or 0} control steps",
         "control period": "unknown" if period is None else f"{1000 * period:g} ms",
         "who answers": who_answers(run.model),
-        "environment steps": f"{run.model.num_timesteps:,}"
+        steps: f"{run.model.num_timesteps:,}"
         + (f", and {n_trial_steps:,} to choose how it decides" if n_trial_steps else ""),
         "training seed": record.seed,
         "made by": f"`{made_by(record, run.model)}`",
@@ -174,6 +177,14 @@ def describe(
     return "\n".join(lines)
 
 
+def ages_trained_on(run: LoadedRun, record: Record) -> list[int]:
+    """Return the ages that an agent has met; one of logs is shown all that its delay brings."""
+    if not record.dataset:
+        return run.model.trained_ages or []  # type: ignore[attr-defined]  # all of ours have them
+    low, high = age_range(0 if record.delay is None else record.delay)
+    return [*range(0 if isinstance(run.model, SAID) else low, high + 1)]  # its planner learns all masks
+
+
 def who_answers(model: Any) -> str:
     """Say who answers in an agent, up to which age, and in which way its planner decides."""
     if not isinstance(model, SAID):
@@ -199,12 +210,14 @@ def made_by(record: Record, model: Any = None) -> str:
 
     :param model: the agent, which has the settings that the preset got since
     """
-    steps = record.options.get("n_timesteps")
-    budget = ["-n", str(steps)] if steps and steps > 0 else []  # rl_zoo3's -1 leaves it to the YAML
     file = config_file(record.algo, bool(record.dataset))
     blocks = yaml.safe_load(file.read_text())
     usual = blocks.get(record.env, blocks["default"])
     usual |= preset_overrides(file, record.preset, record.env, record.delay, dataset=record.dataset)
+    steps = record.options.get("n_timesteps") or -1
+    if steps < 0 and record.hyperparams.get("n_timesteps") not in (None, usual["n_timesteps"]):
+        steps = int(record.hyperparams["n_timesteps"])  # rl_zoo3's -1 leaves it to the YAML, or to -params
+    budget = ["-n", str(steps)] if steps > 0 else []
     newer = usual.keys() - record.hyperparams.keys() - {"policy", "planner_kwargs"}
     had = {name: getattr(model, name) for name in sorted(newer) if hasattr(model, name)} | record.hyperparams
     own = {name: value for name, value in had.items() if value != usual.get(name) and name != "n_timesteps"}

@@ -11,7 +11,8 @@ from sb3_said.delays.space import written_ages
 from sb3_said.files.normalization import normalization_file
 from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.zoo.arguments import TRUST, explained, make_parser
-from sb3_said.zoo.runs import ANSWERS, find_agent, find_normalization
+from sb3_said.zoo.folder import find_agent, find_normalization
+from sb3_said.zoo.runs import ANSWERS
 
 EPILOG = f"""\
 examples:
@@ -68,6 +69,8 @@ def main(argv: list[str] | None = None) -> None:
     )
     parser.add_argument("--compact", action="store_true", help="write weights as float16, and no optimizers")
     args = parser.parse_args(argv)
+    if args.output is not None and args.output.suffix != ".zip":
+        args.output = Path(f"{args.output}.zip")  # as SB3 names agents
     given = {name: getattr(args, name) for name in SAMPLING_SETTINGS if getattr(args, name) is not None}
     settings: dict[str, Any] = {name: None if value == "none" else value for name, value in given.items()}
     expert_ages = args.expert_up_to, args.expert_from

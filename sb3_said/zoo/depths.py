@@ -95,6 +95,7 @@ class DepthPlanners:
             check_tensors("planner", saved["planner"], policy.planner.state_dict())
             policy.planner.load_state_dict(saved["planner"])
         policy.planner_updates.fill_(float(self.gradient_steps))
+        policy.set_answer("planner")  # whoever the run let answer
 
     def _train(self, depth: int) -> None:
         planner = self._own

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sb3_said.files.normalization import normalization_file
 from sb3_said.said.export import export
 from sb3_said.zoo.arguments import TRUST, explained, make_parser
 from sb3_said.zoo.decide import load_said
-from sb3_said.zoo.runs import find_agent
+from sb3_said.zoo.folder import find_agent, find_normalization
 
 EPILOG = f"""\
 examples:
@@ -28,7 +27,7 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(argv)
     with explained(parser):
         export(load_said(args.agent).policy, args.output)
-        statistics = normalization_file(find_agent(args.agent)[0])
+        statistics = find_normalization(*find_agent(args.agent))
     print(f"Wrote {args.output}")
-    if statistics.is_file():
+    if statistics is not None:
         print(f"Its observations are those normalised by {statistics}: normalise them first.")

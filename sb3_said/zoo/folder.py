@@ -1,4 +1,4 @@
-"""A run's folder: one process claims it, and a resume continues its logs."""
+"""A run's folder: one process claims it, a resume continues its logs, and its agents are found in it."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from sb3_said.files.atomic import remove_abandoned
+from sb3_said.files.normalization import normalization_file
+from sb3_said.zoo.answer import BEST_NAME, EXPERT_FOLDER
+from sb3_said.zoo.record import RECORD_NAME, Record
 
 
 def claim_folder(parent: Path, name: str, suffix: str = "") -> Path:
@@ -65,3 +68,39 @@ def drop_undone_episodes(run_dir: Path, steps: int) -> None:
                 break
             size += len(line)
         os.truncate(file, size)  # in place: the environments have opened it, to append to it
+
+
+def find_agent(path: Path) -> tuple[Path, Record | None]:
+    """Return the agent's file, and the record of its run if it lies in a run folder.
+
+    :param path: a run folder, or an agent's ``.zip``
+    :raises ValueError: for a path without an agent
+    """
+    if not path.exists():
+        raise ValueError(
+            f"{path} does not exist; give a run folder such as logs/said/Hopper-v5-delay4-seed1_1 or a .zip."
+        )
+    if path.is_file():
+        folder = path.absolute().parent
+        folder = folder.parent if folder.name == EXPERT_FOLDER else folder
+        return path, Record.read(folder) if (folder / RECORD_NAME).is_file() else None
+    runs = sorted(str(record.parent) for record in path.glob(f"**/{RECORD_NAME}"))
+    if runs and str(path) not in runs:
+        raise ValueError(f"{path} is not a run folder: it holds the runs {', '.join(runs)}.")
+    record = Record.read(path)
+    names = record.agent_name, BEST_NAME
+    for name in names:
+        if (path / name).is_file():
+            return path / name, record
+    raise ValueError(f"{path} has no finished agent: neither {names[0]} nor {names[1]}.")
+
+
+def find_normalization(file: Path, record: Record | None) -> Path | None:
+    """Return where an agent's statistics of ``VecNormalize`` are, None without.
+
+    :param file: of the agent; this and the next as :func:`find_agent` returns them
+    """
+    agents = [file]
+    if record is not None:  # rl_zoo3's checkpoints (--save-freq) have none of their own
+        agents.append(file.with_name(record.agent_name))
+    return next((path for path in map(normalization_file, agents) if path.is_file()), None)

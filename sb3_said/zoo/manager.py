@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import argparse
 import re
+import shutil
+import zlib
 from collections.abc import Sequence
+from contextlib import redirect_stdout
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +23,6 @@ from stable_baselines3.common.logger import Logger, make_output_format
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_said import SAID, DelayedSAC, PlannerTrainingCallback, StableSAC
-from sb3_said.files.agents import SafeSaveMixin
 from sb3_said.files.archive import SavedFileError
 from sb3_said.files.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback, restore_training
 from sb3_said.files.normalization import load_normalization, normalization_file, save_normalization
@@ -27,10 +30,19 @@ from sb3_said.offline import BC, DQL, OfflineAlgorithm
 from sb3_said.offline.datasets import is_file
 from sb3_said.zoo.answer import BEST_NAME, EXPERT_FOLDER, evaluate_answer
 from sb3_said.zoo.arguments import Delay, ending_training, largest_delay
-from sb3_said.zoo.folder import claim_folder, drop_undone_episodes, hold_folder, log_suffix
+from sb3_said.zoo.folder import (
+    claim_folder,
+    drop_undone_episodes,
+    find_agent,
+    find_normalization,
+    hold_folder,
+    log_suffix,
+)
 from sb3_said.zoo.presets import config_file, preset_overrides
 from sb3_said.zoo.record import EVALUATED, Record, make_wrapper, options_of, with_delay
 from sb3_said.zoo.stopping import Stopping, shielded
+
+LONGEST_NAME = 100  # of what a folder says of delays and logs; file systems end at 255
 
 #: What each name on the command line is: a class and the flags that make it so.
 ALGORITHMS: dict[str, tuple[type[DelayedSAC], dict[str, bool]]] = {
@@ -49,9 +61,13 @@ for _name, (_class, _) in ALGORITHMS.items():
     HYPERPARAMS_CONVERTER[_name] = HYPERPARAMS_CONVERTER["sac"]
 
 
+#: Hyper-parameters that are settings themselves, of which each can be given alone.
+NESTED = ("planner_kwargs", "iql_kwargs", "diffusion_kwargs")
+
+
 def with_given(settings: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
-    """Return settings with those of ``-params`` in their place; of planner and V(s), each by itself."""
-    for name in ("planner_kwargs", "iql_kwargs"):
+    """Return settings with those given in their place; of ``NESTED`` ones, each by itself."""
+    for name in NESTED:
         before, now = settings.get(name), given.get(name)
         if isinstance(before, dict) and isinstance(now, dict):
             given = {**given, name: {**before, **now}}
@@ -86,7 +102,8 @@ class Run:
         words = {name: "-".join(re.findall(r"[\w.]+", str(delay))) for name, delay in parts if delay is not None}
         logs = [Path(source).stem if is_file(source) else source.rpartition("/")[2] for source in self.dataset]
         plain = [re.sub(r"[^\w.-]+", "-", log) for log in logs]
-        return "".join(f"-{name}{text}" for name, text in words.items()) + "".join(f"-{log}" for log in plain)
+        text = "".join(f"-{name}{text}" for name, text in words.items()) + "".join(f"-{log}" for log in plain)
+        return text if len(text) <= LONGEST_NAME else f"{text[:LONGEST_NAME]}-{zlib.crc32(text.encode()):08x}"
 
     @property
     def max_delay(self) -> int:
@@ -145,6 +162,11 @@ class DelayedExperimentManager(ExperimentManager):
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Read them as rl_zoo3 does, with the delay around the user's own wrappers, and text that is code evaluated."""
+        if self.run.record is None:  # of settings in settings, rl_zoo3 would drop those of the file
+            given, self.custom_hyperparams = self.custom_hyperparams or {}, None
+            with redirect_stdout(StringIO()):
+                of_file, _ = super().read_hyperparameters()
+            self.custom_hyperparams = with_given({name: of_file[name] for name in NESTED if name in of_file}, given)
         hyperparams, saved = super().read_hyperparameters()
         if self.run.record is not None:  # the run has all of its own, and none of what its YAML holds today
             for settings in (hyperparams, saved):
@@ -162,6 +184,31 @@ class DelayedExperimentManager(ExperimentManager):
             print(f"NO DELAY: this trains on {self.env_name.gym_id} without any delay; --delay 4 adds one of 4 steps.")
         return hyperparams, saved
 
+    def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
+        """Preprocess them as rl_zoo3 does; evaluations are of the task as the YAML has it, too."""
+        made = super()._preprocess_hyperparams(hyperparams)
+        if self._eval_env_kwargs_args is None and self.run.record is None:
+            self.eval_env_kwargs = self.env_kwargs
+        return made
+
+    def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
+        """Make the agent as rl_zoo3 does. Settings that do not fit end the program, and leave no new folder behind.
+
+        :raises SystemExit: for them
+        """
+        is_new = self.lock is None
+        try:
+            with ending_training(ValueError, TypeError, AssertionError, ImportError, OSError):
+                return self._set_up()
+        except SystemExit:
+            if is_new and self.lock is not None:
+                self.release()
+                shutil.rmtree(self.folder)
+            raise
+
+    def _set_up(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
+        return super().setup_experiment()
+
     def create_envs(self, *args: Any, **kwargs: Any) -> VecEnv:
         """Make environments of the expert's delay, in training as in the evaluations beside it.
 
@@ -177,8 +224,8 @@ class DelayedExperimentManager(ExperimentManager):
 
     def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
         """Normalise as rl_zoo3 does, but read what a given agent (-i) learned from a file without pickle."""
-        given = normalization_file(Path(self.trained_agent)) if self.continue_training else None
-        if given is not None and given.exists():
+        given = find_normalization(*find_agent(Path(self.trained_agent))) if self.continue_training else None
+        if given is not None:
             env = load_normalization(given, env, training=not eval_env)
             env.norm_reward = env.norm_reward and not eval_env
         elif self.normalize:
@@ -205,8 +252,14 @@ class DelayedExperimentManager(ExperimentManager):
         self.monitor_kwargs["override_existing"] = not self.checkpoint.exists()
 
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
-        super()._save_config(saved_hyperparams)
-        hyperparams = {**saved_hyperparams, "env_wrapper": self._own_wrappers}
+        """Write them; of a resume, :meth:`learn` does so once the checkpoint has been found to fit."""
+        self._to_save = saved_hyperparams
+        if self.run.record is None:
+            self._write_config()
+
+    def _write_config(self) -> None:
+        super()._save_config(self._to_save)
+        hyperparams = {**self._to_save, "env_wrapper": self._own_wrappers}
         hyperparams.pop("env_kwargs", None)
         Record(
             self.algo,
@@ -261,6 +314,8 @@ class DelayedExperimentManager(ExperimentManager):
                 restore_training(model, self.checkpoint, callbacks)  # type: ignore[arg-type]  # one of ALGORITHMS
             print(f"Resuming {self.save_path} at step {model.num_timesteps}")
             drop_undone_episodes(self.folder, model.num_timesteps // model.n_envs)
+        if self.run.record is not None:
+            self._write_config()
         taken = model.num_timesteps if resumes else 0  # learn() counts the steps of an agent given with -i anew
         model.set_logger(self._logger(taken))
         # rl_zoo3: -1 is the default, anything below logs nothing by itself
@@ -271,6 +326,10 @@ class DelayedExperimentManager(ExperimentManager):
                 self._learn(model, max(self.n_timesteps - taken, 0), **how)
                 if self.stopping.is_asked:
                     raise KeyboardInterrupt
+        except SystemExit:
+            if self.run.record is not None:  # the planner's checkpoint is of the settings before
+                self.run.record.write(self.folder)
+            raise
         except KeyboardInterrupt:
             self.stopping.is_asked = True
             written = not self.stopping.is_forced and self._save_checkpoint()
@@ -300,12 +359,17 @@ class DelayedExperimentManager(ExperimentManager):
         return self.checkpointing.save()
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
-        assert isinstance(model, SafeSaveMixin)
+        """Save as rl_zoo3 does, which takes a task's name with a dot for a file's with a suffix, and without pickle."""
+        assert isinstance(model, DelayedSAC)
         model.task = self.env_name.gym_id  # which environments in other processes do not tell
-        super().save_trained_model(model)
-        vec_normalize = model.get_vec_normalize_env()
-        if vec_normalize is not None:
-            save_normalization(normalization_file(self.folder / f"{self.env_name}.zip"), vec_normalize)
+        file = self.folder / f"{self.env_name}.zip"
+        print(f"Saving to {self.save_path}")
+        model.save(file)
+        if self.save_replay_buffer:
+            model.save_replay_buffer(self.folder / "replay_buffer.pkl")
+        if (vec_normalize := model.get_vec_normalize_env()) is not None:
+            vec_normalize.save(str(Path(self.params_path, "vecnormalize.pkl")))  # for rl_zoo3's own tools
+            save_normalization(normalization_file(file), vec_normalize)
 
     def _logger(self, steps: int) -> Logger:
         """Log to the screen, to progress.csv (one file per resume) and to TensorBoard if asked for.

@@ -13,7 +13,6 @@ from sb3_said.files.checkpoint import TrainingCheckpointCallback
 from sb3_said.offline import OfflineAlgorithm
 from sb3_said.said import SAID
 from sb3_said.said.training import PLANNER_CHECKPOINT_NAME
-from sb3_said.zoo.arguments import ending_training
 from sb3_said.zoo.manager import DelayedExperimentManager, Run
 
 
@@ -38,13 +37,12 @@ class OfflineExperimentManager(DelayedExperimentManager):
                 "dataset is: leave it out."
             )
 
-    def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
-        """Make the agent as rl_zoo3 does, and read the dataset; a dataset that does not fit ends the program."""
-        made = super().setup_experiment()
+    def _set_up(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
+        """Make the agent as rl_zoo3 does, and read the dataset."""
+        made = super()._set_up()
         assert made is not None and isinstance(made[0], OfflineAlgorithm)  # no -optimize, as the constructor saw to
         model = made[0]
-        with ending_training(ValueError, ImportError, OSError):
-            model.take_dataset([*self.run.dataset], self.show_progress)
+        model.take_dataset([*self.run.dataset], self.show_progress)
         replay = model.replay_buffer
         print(f"Learning from {replay.size():,} logged steps; no environment is stepped but in evaluations.")
         return made

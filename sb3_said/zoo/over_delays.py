@@ -20,7 +20,7 @@ import torch as th
 from sb3_said.delays import FixedDelay
 from sb3_said.delays.text import age_range, make_process
 from sb3_said.evaluation import Summary, plots
-from sb3_said.zoo.arguments import TRUST, add_playing, check_positive, explained, largest_delay, make_parser, read_delay
+from sb3_said.zoo.arguments import TRUST, add_playing, check_positive, explained, make_parser, read_delay
 from sb3_said.zoo.cells import AGE, Cell, Results, make_table, print_manners, print_scores, print_table
 from sb3_said.zoo.runs import ANSWERS, LoadedRun, answering, answers, delay_name, load_run, longest_delay, origin
 
@@ -71,7 +71,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--n-envs", type=int, default=8, help="episodes played side by side (default: 8)")
     parser.add_argument("--workers", type=int, default=1, help="cells played at once, in processes (default: 1)")
     args = parser.parse_args(argv)
-    with explained(parser):
+    with explained(parser, goes_on=True):
         check_positive(args, "episodes", "n_envs", "workers", "num_threads")
         th.set_num_threads(args.num_threads)
         if args.plot is not None:
@@ -241,24 +241,25 @@ def cells_of(label: str, row: list[LoadedRun], delays: list[int | str], only: st
                 answer=answer,
                 delay=delay,
                 sha256=digest,
-                obstacle=obstacle(run.model, answer, delay),
+                obstacle=obstacle(run, answer, delay),
                 **{key: run.info[key] for key in ("algo", "file", "trained_steps")},
             )
 
 
-def obstacle(model: Any, answer: str | None, delay: int | str) -> str | None:
+def obstacle(run: LoadedRun, answer: str | None, delay: int | str) -> str | None:
     """Say why an agent cannot play under a delay; None where it can.
 
-    :param model: an SB3 algorithm, whose policy has a planner where that answers
+    :param run: whose action delay, if its task has one, comes on top
     :param answer: who acts in a SAID agent
     """
-    longest = longest_delay(model) or 0
-    if largest_delay(delay) > longest:
-        return f"it was built for delays 0..{longest}"
+    longest, model = longest_delay(run.model) or 0, run.model
+    low, high = (sum(ends) for ends in zip(age_range(delay), age_range(run.action_delay), strict=True))
+    if high > longest:
+        added = f", and its task delays actions by {run.action_delay}" if run.action_delay else ""
+        return f"it was built for delays 0..{longest}{added}"
     if answer not in (None, "expert"):
-        low, high = age_range(delay)
         try:
-            model.policy.planner.check_ages(list(range(low, high + 1)))
+            model.policy.planner.check_ages(list(range(low, high + 1)))  # type: ignore[union-attr]  # it has one
         except ValueError as error:
             return str(error).removesuffix(".")
     return None

@@ -29,10 +29,10 @@ from sb3_said.files.agents import task_of
 from sb3_said.files.archive import SavedFileError, load_metadata
 from sb3_said.files.normalization import load_normalization, normalization_file
 from sb3_said.said.policies import Answer
-from sb3_said.zoo.answer import BEST_NAME, EXPERT_FOLDER
 from sb3_said.zoo.arguments import Delay, largest_delay
-from sb3_said.zoo.manager import ALGORITHMS, ALGOS
-from sb3_said.zoo.record import RECORD_NAME, WRAPPER, Record, import_packages, make_wrapper
+from sb3_said.zoo.folder import find_agent, find_normalization
+from sb3_said.zoo.manager import ALGORITHMS
+from sb3_said.zoo.record import WRAPPER, Record, import_packages, make_wrapper
 
 ANSWERS = get_args(Answer)
 
@@ -50,6 +50,8 @@ class LoadedRun:
     """of the run, for results"""
     info: dict[str, Any]
     """what was loaded, in JSON types: algo, env, delay, file, trained_steps"""
+    action_delay: Any = 0
+    """of its task's wrapper, which comes on top of any observation delay"""
 
     def play(self, n_episodes: int, seed: int, n_envs: int = 1, age_error: int = 0, **kwargs: Any) -> Rollout:
         """Play whole episodes, see :func:`~sb3_said.evaluation.rollout`.
@@ -84,7 +86,7 @@ def load_run(
     Nothing in its files is run. What makes the task is: the installed modules that ``run.json`` names are imported.
 
     :param path: a run folder such as ``logs/said/Hopper-v5-delay4-seed1_1``, or an agent's ``.zip``
-    :param algo: name of the algorithm; read from the run folder where there is one, or else from the file
+    :param algo: name of the algorithm, where neither a run folder nor the file says it
     :param env_id: task to play; the one of the run folder or of the file by default
     :param delay: observation delay to play under; the trained one by default, and outside a run folder the largest that
         the agent was built for
@@ -98,13 +100,12 @@ def load_run(
     """
     file, record = find_agent(Path(path))
     hyperparams = record.hyperparams if record is not None else {}
-    if record is None and (algo is None or env_id is None):
-        own_algo, own_task = described(file)
-        algo, env_id = algo or own_algo, env_id or own_task
-    elif record is not None:
-        algo, env_id = algo or record.algo, env_id or record.env
-    if algo not in ALGOS:
-        raise ValueError(f"The algorithm of {file} is not known ({algo}): give --algo, one of {', '.join(ALGOS)}.")
+    own_algo, own_task = described(file) if record is None else (record.algo, record.env)
+    unknown = [name for name in (own_algo or algo, algo or own_algo) if name not in ALGORITHMS]
+    if unknown:  # an agent of SB3 itself would run code of its file
+        names = ", ".join(ALGORITHMS)
+        raise ValueError(f"The algorithm of {file} is not known ({unknown[0]}): give --algo, one of {names}.")
+    algo, env_id = str(own_algo or algo), env_id or own_task
     if env_id is None:
         raise ValueError(f"The task of {file} is not known: no run folder is around it, and it names none. Give --env.")
     for key in ("frame_stack", "vec_env_wrapper"):
@@ -115,7 +116,7 @@ def load_run(
         record.require("env_wrapper", "env_kwargs")
     import_packages([*(record.gym_packages if record is not None else ()), *gym_packages])
 
-    model = ALGOS[algo].load(file, device=device)
+    model = ALGORITHMS[algo][0].load(file, device=device)
     wrappers = record.wrappers if record is not None else []
     if delay is not None or record is None:
         wrappers = _with_delay(wrappers, delay, model)
@@ -138,7 +139,9 @@ def load_run(
     env.close()
     info = {"algo": algo, "env": env_id, "delay": delay_name(delay_process)}
     info |= {"file": str(file), "trained_steps": model.num_timesteps}
-    return LoadedRun(model, make_env, _load_normalize(file, record, make_env), file.parent, info)
+    ours = next((kwargs for name, kwargs in _named(wrappers) if "DelayedObservationWrapper" in str(name)), {})
+    normalize = _load_normalize(file, record, make_env)
+    return LoadedRun(model, make_env, normalize, file.parent, info, ours.get("action_delay", 0))
 
 
 def described(file: Path) -> tuple[str | None, str | None]:
@@ -149,42 +152,6 @@ def described(file: Path) -> tuple[str | None, str | None]:
         return None, None
     names = [name for name, (kind, _) in ALGORITHMS.items() if kind.__name__ == metadata["kind"]]
     return (names[0] if len(names) == 1 else None), task_of(metadata)
-
-
-def find_agent(path: Path) -> tuple[Path, Record | None]:
-    """Return the agent's file, and the record of its run if it lies in a run folder.
-
-    :param path: a run folder, or an agent's ``.zip``
-    :raises ValueError: for a path without an agent
-    """
-    if not path.exists():
-        raise ValueError(
-            f"{path} does not exist; give a run folder such as logs/said/Hopper-v5-delay4-seed1_1 or a .zip."
-        )
-    if path.is_file():
-        folder = path.absolute().parent
-        folder = folder.parent if folder.name == EXPERT_FOLDER else folder
-        return path, Record.read(folder) if (folder / RECORD_NAME).is_file() else None
-    runs = sorted(str(record.parent) for record in path.glob(f"**/{RECORD_NAME}"))
-    if runs and str(path) not in runs:
-        raise ValueError(f"{path} is not a run folder: it holds the runs {', '.join(runs)}.")
-    record = Record.read(path)
-    names = record.agent_name, BEST_NAME
-    for name in names:
-        if (path / name).is_file():
-            return path / name, record
-    raise ValueError(f"{path} has no finished agent: neither {names[0]} nor {names[1]}.")
-
-
-def find_normalization(file: Path, record: Record | None) -> Path | None:
-    """Return where an agent's statistics of ``VecNormalize`` are, None without.
-
-    :param file: of the agent; this and the next as :func:`find_agent` returns them
-    """
-    agents = [file]
-    if record is not None:  # rl_zoo3's checkpoints (--save-freq) have none of their own
-        agents.append(file.with_name(record.agent_name))
-    return next((path for path in map(normalization_file, agents) if path.is_file()), None)
 
 
 def delay_name(process: DelayProcess) -> int | str:
@@ -259,10 +226,15 @@ def _with_delay(wrappers: list[Any], delay: Delay, model: BaseAlgorithm) -> list
     kwargs: dict[str, Any] = {"delay": max_delay if delay is None else delay, "max_delay": max_delay}
     if has_state_history(model.observation_space):
         kwargs["state_history"] = True
-    given = [next(iter(w.items())) if isinstance(w, dict) else (w, {}) for w in wrappers]
+    given = _named(wrappers)
     if not any("DelayedObservationWrapper" in str(name) for name, _ in given):
         given.append((WRAPPER, {}))
     return [{name: {**old, **kwargs} if "DelayedObservationWrapper" in str(name) else old} for name, old in given]
+
+
+def _named(wrappers: list[Any]) -> list[tuple[Any, dict[str, Any]]]:
+    """Return the names and arguments of wrappers, as rl_zoo3's ``env_wrapper`` has them."""
+    return [next(iter(w.items())) if isinstance(w, dict) else (w, {}) for w in wrappers]
 
 
 def _check_spaces(model: BaseAlgorithm, env: gym.Env[Any, Any], file: Path) -> None:

@@ -13,7 +13,7 @@ import rl_zoo3.train
 
 from sb3_said.offline import OfflineAlgorithm
 from sb3_said.offline.datasets import is_file
-from sb3_said.zoo.arguments import Delay, add_delay, explained, make_parser, read_delay
+from sb3_said.zoo.arguments import Delay, add_delay, check_positive, explained, make_parser, read_delay
 from sb3_said.zoo.manager import ALGORITHMS, ALGOS, DelayedExperimentManager, Run
 from sb3_said.zoo.offline import OfflineExperimentManager
 from sb3_said.zoo.presets import PRESETS
@@ -97,10 +97,10 @@ def main(argv: list[str] | None = None) -> None:
     sys.argv = [sys.argv[0], "--algo", algo, *zoo_argv]
     try:
         rl_zoo3.train.train()
-    except (AssertionError, ImportError, ValueError) as error:
+    except (AssertionError, ImportError, NameError, SyntaxError, ValueError) as error:
         if made:
             raise
-        parser.error(str(error))  # of the options that rl_zoo3 reads
+        parser.error(str(error))  # of the options that rl_zoo3 reads, some of which it evaluates
     finally:
         for manager in made:
             manager.release()
@@ -121,10 +121,12 @@ def read_command_line(argv: list[str]) -> tuple[Run, str, list[str]]:
     if options.num_threads is not None or options.resume is None:  # whose own number stands before
         zoo_argv.append(f"--num-threads={1 if options.num_threads is None else options.num_threads}")
     delay, expert_delay = read_delay(options.delay), read_delay(options.expert_delay)
+    check_positive(options, "checkpoint_freq")
     if options.resume is not None:
         record = Record.read(options.resume)
         fixed = {"--algo": options.algo, "--delay": delay, "--expert-delay": expert_delay, "--preset": options.preset}
         fixed |= {"--seed": options.seed, "--env": options.env, "--dataset": options.dataset or None}
+        fixed |= of_the_start(zoo_argv)
         if given := [name for name, value in fixed.items() if value is not None]:
             raise ValueError(f"--resume goes on with the run's own {', '.join(given)}: leave them out.")
         freq = record.checkpoint_freq if options.checkpoint_freq is None else options.checkpoint_freq
@@ -139,6 +141,14 @@ def read_command_line(argv: list[str]) -> tuple[Run, str, list[str]]:
     dataset = [os.path.abspath(source) if is_file(source) else source for source in options.dataset]
     run = Run(delay, options.preset or "cpu", options.checkpoint_freq, None, expert_delay, None, dataset)
     return run, algo, [f"--env={options.env or 'Pendulum-v1'}", f"--seed={seed}", *zoo_argv]
+
+
+def of_the_start(argv: list[str]) -> dict[str, str | None]:
+    """Return those of rl_zoo3's options that have no effect once a run has begun, with what they were given."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    for names in (("-conf", "--conf-file"), ("-f", "--log-folder"), ("--storage",), ("--study-name",), ("--trial-id",)):
+        parser.add_argument(*names, dest=names[-1])
+    return vars(parser.parse_known_args(argv)[0])
 
 
 def check_dataset(algo: str, dataset: list[str], expert_delay: Delay) -> None:
@@ -163,7 +173,7 @@ def joined_settings(argv: list[str]) -> list[str]:
     given twice, it takes the later value.
     """
     settings = argparse.ArgumentParser(add_help=False, allow_abbrev=False)  # "--env" is not short for "--env-kwargs"
-    for names in (("-params", "--hyperparams"), ("--env-kwargs",), ("--eval-env-kwargs",)):
+    for names in (("-params", "--hyperparams"), ("--env-kwargs",), ("--eval-env-kwargs",), ("--gym-packages",)):
         settings.add_argument(*names, dest=names[0], nargs="+", action="extend", default=[])
     given, rest = settings.parse_known_args(argv)
     return [*rest, *(word for name, words in vars(given).items() if words for word in (name, *words))]

@@ -90,7 +90,7 @@ def main(argv: list[str] | None = None) -> None:
         "(default: 1)")  # fmt: skip
     add("-P", "--progress", action="store_true", help="show a progress bar while a planner trains")
     args = parser.parse_args(argv)
-    with explained(parser):
+    with explained(parser, goes_on=True):
         check(args)
         th.set_num_threads(args.num_threads)
         tune(args)

@@ -17,6 +17,7 @@ from small_run import ENV, write_run
 from sb3_said import SAID
 from sb3_said.zoo import card, decide, evaluate, over_delays
 from sb3_said.zoo.record import Record
+from sb3_said.zoo.runs import load_run
 
 
 @pytest.fixture(scope="module")
@@ -75,6 +76,21 @@ def test_the_command_makes_the_agent_again_whatever_the_preset_says_since() -> N
                     options={"trained_agent": "old.zip"}, env_kwargs={"forward_reward_weight": 2.0})  # fmt: skip
     command = card.made_by(record, SimpleNamespace(gamma=0.99, planner_kwargs={"depth": 2}))
     assert command.endswith("-i old.zip --seed 1 -params gamma:0.99 --env-kwargs forward_reward_weight:2.0")
+
+
+def test_the_command_has_the_budget_wherever_it_was_given() -> None:
+    record = Record("said", "Hopper-v5", 3, 4, hyperparams={"n_timesteps": 30}, options={"n_timesteps": -1})
+    assert " -n 30 --seed 3" in card.made_by(record)
+    assert " -n " not in card.made_by(replace(record, hyperparams={"n_timesteps": 5e5}))
+
+
+def test_an_agent_of_logs_has_met_all_ages_of_its_delay(run: Path) -> None:
+    played = load_run(run, device="cpu")
+    record = Record("said", ENV, 3, [1, 2], dataset=["a.npz"])
+    assert card.ages_trained_on(played, record) == [0, 1, 2]
+    assert card.ages_trained_on(played, replace(record, dataset=[])) == played.model.trained_ages  # type: ignore[attr-defined]
+    facts = card.describe(played, record, SimpleNamespace(settings={"n_episodes": 1, "seed": 0}), [], [], None, 0)  # type: ignore[arg-type]
+    assert "| gradient steps, on logs | 60 |" in facts
 
 
 def test_the_trials_steps_are_those_of_the_log(tmp_path: Path) -> None:

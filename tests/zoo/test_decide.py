@@ -93,6 +93,12 @@ def test_statistics_of_normalised_observations_go_with_the_file(run: Path, tmp_p
     decide.main([str(source), "--compact", "-o", str(source)])  # in place
 
 
+def test_a_file_s_name_gets_its_suffix(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    decide.main([str(run), "--temperature", "0.5", "-o", str(tmp_path / "hopper_t0.5")])
+    assert f"Wrote {tmp_path / 'hopper_t0.5.zip'}" in capsys.readouterr().out
+    assert SAID.load(tmp_path / "hopper_t0.5.zip", device="cpu").policy.planner.config.temperature == 0.5
+
+
 def test_without_settings_it_shows_them(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     decide.main([str(run / f"{ENV}.zip")])
     out = capsys.readouterr().out

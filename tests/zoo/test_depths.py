@@ -159,6 +159,17 @@ def test_an_agent_with_a_planner_put_in_is_saved_with_it(run, tmp_path):
         th.testing.assert_close(loaded.policy.state_dict(), planners.model.policy.state_dict(), rtol=0, atol=0)
 
 
+def test_a_planner_put_in_answers_whoever_did_before(run, tmp_path):
+    planners = make(run, tmp_path, 2)
+    policy = planners.model.policy
+    policy.make_student(8)
+    policy.student.preferred.fill_(1.0)
+    policy.expert_preferred.fill_(1.0)
+    planners.train([2])
+    planners.put(2)
+    assert policy.who_answers == "planner"
+
+
 def test_planners_have_the_runs_settings_whatever_the_defaults_are_then(run, tmp_path, monkeypatch):
     expected = make(run, tmp_path / "before")
     expected.train([1, 2])

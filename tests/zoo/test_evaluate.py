@@ -125,6 +125,20 @@ def test_an_agent_without_its_run_folder(run: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(left.returns, right.returns)
 
 
+def test_an_agent_of_sb3_itself_is_not_opened(run: Path, tmp_path: Path) -> None:
+    """Its file may run code, whatever a run.json beside it says."""
+    from stable_baselines3 import PPO
+
+    PPO("MlpPolicy", "Pendulum-v1", device="cpu").save(tmp_path / "Pendulum-v1.zip")
+    Record("ppo", "Pendulum-v1").write(tmp_path)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PPO, "load", lambda *_, **__: pytest.fail("opened"))
+        for algo in (None, "sadr"):
+            with pytest.raises(ValueError, match=r"is not known \(ppo\): give --algo, one of said, sac"):
+                load_run(tmp_path, algo=algo)
+    assert load_run(run, algo="bc", device="cpu").info["algo"] == "said"  # as its record says
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

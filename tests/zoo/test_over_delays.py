@@ -233,13 +233,13 @@ def test_only_the_warning_of_another_delay_is_silent(sadr: Path) -> None:
 
 
 def test_a_planner_of_one_delay_plays_no_other(said: Path) -> None:
-    model: Any = load_run(said, device="cpu").model
-    planner = model.policy.planner
+    run = load_run(said, device="cpu")
+    planner = run.model.policy.planner  # type: ignore[union-attr]  # it has one
     planner.config = replace(planner.config, mask="fixed", present="inpainted")
-    found = {delay: over_delays.obstacle(model, "planner", delay) for delay in (1, 2, "UniformDelay(0, 2)")}
+    found = {delay: over_delays.obstacle(run, "planner", delay) for delay in (1, 2, "UniformDelay(0, 2)")}
     assert found.pop(2) is None
     assert all(reason.startswith("A planner with mask='fixed' plans at age 2 only") for reason in found.values())
-    assert over_delays.obstacle(model, "expert", 1) is None and over_delays.obstacle(model, "student", 1)
+    assert over_delays.obstacle(run, "expert", 1) is None and over_delays.obstacle(run, "student", 1)
 
 
 def test_the_expert_of_a_planner_of_one_delay_plays_all(said: Path, tmp_path: Path) -> None:

@@ -73,6 +73,30 @@ def test_a_task_without_a_delay_is_said_loudly(tmp_path: Path, capsys: pytest.Ca
     assert load_run(tmp_path / "sadr" / "Pendulum-v1-seed3_2", device="cpu").info["delay"] == 1
 
 
+def test_a_task_may_have_a_dot_in_its_name(tmp_path: Path) -> None:
+    gym.register("Arm.Reach-v1", lambda: gym.make("Pendulum-v1").unwrapped, max_episode_steps=200)
+    try:
+        train_here(tmp_path, f"--algo sadr --env Arm.Reach-v1 --delay 1 {QUICK}")
+        run = tmp_path / "sadr" / "Arm.Reach-v1-delay1-seed3_1"
+        assert load_run(run, device="cpu").model.num_timesteps == 40
+        train.main(["--resume", str(run), "-n", "50"])
+        assert load_run(run, device="cpu").model.num_timesteps == 50
+    finally:
+        del gym.registry["Arm.Reach-v1"]
+
+
+def test_an_action_delay_of_the_task_counts_among_what_it_can_play(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    params = ["-params", f"env_wrapper:[{{{WRAPPER!r}: {{'delay': 2, 'action_delay': 1}}}}]"]
+    train_here(tmp_path, f"--algo sadr --env Pendulum-v1 {QUICK}", *params)
+    run, few = tmp_path / "sadr" / "Pendulum-v1-seed3_1", ["--episodes", "1", "--device", "cpu"]
+    over_delays.main([str(run), *few, "--delays", "0", "2", "3", "--json", str(tmp_path / "over.json")])
+    shown = capsys.readouterr().out
+    assert "2 of 3 cells to play" in shown
+    assert "cannot play delay 3: it was built for delays 0..3, and its task delays actions by 1" in shown
+
+
 def forget_mine(monkeypatch: pytest.MonkeyPatch) -> None:
     """Be a process that has not imported the user's package."""
     for registered in (gym.registry, sys.modules):

@@ -181,6 +181,40 @@ def test_a_resume_takes_no_setting_that_the_run_never_had(tmp_path: Path) -> Non
     assert config_of(run) == {**before, "tau": 0.02}
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [("--eval-freq -1", "had 1 EvalCallback"), ("-params planner_gradient_steps:11", "gradient_steps was 10")],
+)
+def test_a_refused_resume_leaves_the_run_as_it_was(words: str, message: str, finished: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(finished, tmp_path / "copy"))
+    before = json.loads((copy / "run.json").read_text())
+    with pytest.raises(SystemExit, match=message):
+        train.main(["--resume", str(copy), *words.split()])
+    assert json.loads((copy / "run.json").read_text()) == before
+    train.main(["--resume", str(copy)])
+    assert_same_agents(finished, copy)
+
+
+def test_a_file_s_settings_reach_the_evaluations_and_stay_beside_those_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planner = {"depth": 1, "d_model": 32, "temperature": 0.3}
+    block = {"n_timesteps": 60, "policy": "MultiInputPolicy", "env_kwargs": {"g": 3.0}, "planner_kwargs": planner}
+    (tmp_path / "own.yml").write_text(yaml.safe_dump({"default": block}))
+    made: list[Any] = []
+
+    def learn(of: manager.DelayedExperimentManager, model: SAID) -> None:
+        assert of.evaluation is not None and model.env is not None
+        made.extend([*model.env.get_attr("g"), *of.evaluation.eval_env.get_attr("g"), model.planner_kwargs])
+
+    monkeypatch.setattr(manager.DelayedExperimentManager, "learn", learn)
+    monkeypatch.setattr(manager.DelayedExperimentManager, "save_trained_model", lambda *_: None)
+    command = f"--algo said --env Pendulum-v1 --delay 1 --verbose 0 -f {tmp_path} -conf {tmp_path}/own.yml -params"
+    train.main([*command.split(), "planner_kwargs:dict(horizon=3)"])
+    assert made[:2] == [3.0, 3.0]
+    assert {name: made[2][name] for name in (*planner, "horizon")} == {**planner, "horizon": 3}
+
+
 def lengths(monitor: Path) -> list[int]:
     """Return the lengths of the episodes in a file of SB3's Monitor."""
     return [int(row.split(",")[1]) for row in monitor.read_text().splitlines()[2:]]
@@ -242,6 +276,13 @@ def test_the_log_path_names_the_delay(delay: Delay, name: str) -> None:
     assert manager.Run(delay, "smoke").name == name
 
 
+def test_the_log_path_of_many_logs_is_one_that_a_disk_takes() -> None:
+    parts = [f"hopper_medium_replay_part_{k}.npz" for k in range(30)]
+    names = [manager.Run(2, "cpu", dataset=parts[:n]).name for n in (1, 29, 30)]
+    assert names[0] == "-delay2-hopper_medium_replay_part_0"
+    assert len(set(names)) == 3 and max(map(len, names)) < 120
+
+
 def test_the_expert_can_learn_under_another_delay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     command = "--algo said --env Pendulum-v1 --delay 0 3 --expert-delay 0 --preset smoke -n 520 --seed 3"
     ages: list[int] = []
@@ -280,12 +321,41 @@ def test_the_expert_can_learn_under_another_delay(tmp_path: Path, monkeypatch: p
         ("--env Pendulun-v1", "you maybe meant Pendulum-v1?"),
         ("-i nowhere.zip", "must be a valid path to a .zip file"),
         ("--gym-packages not_there", "No module named 'not_there'"),
+        ("--checkpoint-freq 0", "--checkpoint-freq must be at least 1, got 0"),
+        ("-params gamma:O.9", "invalid syntax"),
+        ("-params gamma:nine", "name 'nine' is not defined"),
     ],
 )
 def test_says_what_is_wrong(words: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         train.main(["--env", "Pendulum-v1", "-f", str(tmp_path), *words.format(tmp_path).split()])
     assert stop.value.code == 2 and message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("-params gama:0.9", "has no argument gama; did you mean gamma"),
+        ("-params planner_kwargs:dict(deepth=3)", "The planner has no setting deepth"),
+        ("--delay 2 -params normalize:True", "norm_obs_keys"),
+        ("--env CartPole-v1", "action space"),
+        ("--algo sadr -params planner_gradient_steps:3", "has no argument planner_gradient_steps"),
+    ],
+)
+def test_settings_that_do_not_fit_are_said_and_leave_no_folder(words: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match=f"sb3-said train: error: .*{message}"):
+        train.main(["--env", "Pendulum-v1", "-f", str(tmp_path), "--verbose", "0", *words.split()])
+    assert [file for file in tmp_path.rglob("*") if file.is_file()] == []
+    assert not [*tmp_path.glob("*/*")]
+
+
+def test_a_resume_takes_no_option_of_the_start(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for words in ("-conf own.yml", "-f elsewhere", "--storage x.log", "--study-name s", "--trial-id 3"):
+        with pytest.raises(SystemExit):
+            train.main(["--resume", str(finished), *words.split()])
+        assert "goes on with the run's own --" in capsys.readouterr().err
 
 
 # ---------------------------------------------------------------------------------------------------- failures
@@ -362,6 +432,7 @@ def test_a_given_agent_is_found_from_another_folder_too(monkeypatch: pytest.Monk
         ("-n 5 --eval-freq -1", "-n 5 --eval-freq -1"),
         ("-params a:1 b:2 -n 5 --hyperparams b:3 -P", "-n 5 -P -params a:1 b:2 b:3"),
         ("--env X --env-kwargs c:1 -params a:1 --env-kwargs d:2", "--env X -params a:1 --env-kwargs c:1 d:2"),
+        ("--gym-packages a -n 5 --gym-packages b", "-n 5 --gym-packages a b"),
     ],
 )
 def test_settings_given_twice_are_joined(given: str, read: str) -> None:
