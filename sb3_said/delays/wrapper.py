@@ -9,7 +9,7 @@ import numpy as np
 
 from sb3_said.delays.combined import TotalDelay
 from sb3_said.delays.processes import LARGEST_DELAY, Delay, as_process, checked_count
-from sb3_said.delays.receivers import RECEIVERS, Actuator
+from sb3_said.delays.receivers import RECEIVERS, Actuator, NewestPacket
 from sb3_said.delays.space import EXECUTED, UNDELAYED, check_task, delayed_space, scale_action
 from sb3_said.delays.text import age_range, as_text, make_process
 
@@ -104,17 +104,14 @@ class DelayedObservationWrapper(
             raise ValueError(f"max_delay={max_delay} is smaller than the largest delay {self.process.max_delay}.")
         if receiver not in RECEIVERS:
             raise ValueError(f"receiver is {receiver!r}, expected one of {tuple(RECEIVERS)}.")
-        observed, self.actuator = self.process, None
-        if isinstance(self.process, TotalDelay) and self.process.action_varies:
-            if state_history:
-                raise ValueError(
-                    f"Under {self.process.action} every action takes a time of its own, so the actions sent between "
-                    "two states are not those executed; leave state_history=False, or give an action delay that stays "
-                    "for an episode."
-                )
-            observed = as_process(self.process.observation)
-            self.actuator = Actuator(RECEIVERS[receiver](as_process(self.process.action)), observed.max_delay)
-        self.receiver = RECEIVERS[receiver](observed)
+        self._receiver = RECEIVERS[receiver]
+        self.receiver, self.actuator = self.make_receivers()
+        if self.actuator is not None and state_history:
+            raise ValueError(
+                f"Under {self.actuator.receiver.process} every action takes a time of its own, so the actions sent "
+                "between two states are not those executed; leave state_history=False, or give an action delay that "
+                "stays for an episode."
+            )
 
         self._task_action_space = act_space
         self.state_history = state_history
@@ -125,6 +122,14 @@ class DelayedObservationWrapper(
         self._actions = np.zeros((n, *act_space.shape), np.float32)  # a_{t-D-1..t-1}, each beside the state it led to
         self._states = np.zeros((n, *obs_space.shape), np.float32)  # s_{t-D..t}
         self._known = np.zeros(n, np.float32)  # which of these were handed out
+
+    def make_receivers(self) -> tuple[NewestPacket, Actuator | None]:
+        """Return new receivers of observations, and of actions where each takes a time of its own."""
+        observed, actuator = self.process, None
+        if isinstance(self.process, TotalDelay) and self.process.action_varies:
+            observed = as_process(self.process.observation)
+            actuator = Actuator(self._receiver(as_process(self.process.action)), observed.max_delay)
+        return self._receiver(observed), actuator
 
     @property
     def age_range(self) -> tuple[int, int]:

@@ -36,13 +36,15 @@ class SafeSaveMixin(OffPolicyAlgorithm):
     """Makes an SB3 off-policy algorithm save to and load from files without pickle. Name it before the algorithm.
 
     Every argument of the constructor after ``policy, env`` must be an attribute of the same name. A subclass adds what
-    it counts to ``counters``, and to ``own_classes`` the classes that its constructor takes where none are given.
+    it counts to ``counters``, to ``own_classes`` the classes that its constructor takes where none are given, and to
+    ``settings_arguments`` those of its arguments that are settings by name, of which ``load`` may be given some.
     """
 
     counters: ClassVar[tuple[str, ...]] = (
         "num_timesteps", "_total_timesteps", "_episode_num", "_n_updates", "_current_progress_remaining"
     )  # fmt: skip
     own_classes: ClassVar[tuple[type, ...]] = ()
+    settings_arguments: ClassVar[tuple[str, ...]] = ()
 
     task: str | None = None
     """id of the Gymnasium task that it was made for, where that is known"""
@@ -146,6 +148,9 @@ class SafeSaveMixin(OffPolicyAlgorithm):
                 f"The given policy_kwargs {kwargs['policy_kwargs']} differ from {stored} in the file, which the saved"
                 " networks were built with. Leave them out of the call."
             )
+        for name in cls.settings_arguments:  # what is not given stays as the file has it
+            if isinstance(kwargs.get(name), dict):
+                kwargs[name] = {**(arguments.get(name) or {}), **kwargs[name]}
         policy = (arguments := arguments | kwargs).pop("policy_class", cls.policy_aliases["MlpPolicy"])
         with readable(path, explained=(ValueError, AssertionError)):  # SB3 asserts what it needs of an environment
             arguments |= {"device": device, "_init_setup_model": False}

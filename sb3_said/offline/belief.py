@@ -70,12 +70,9 @@ class LearnedBelief(nn.Module):
         self.register_buffer("mean", th.zeros(obs_dim))
         self.register_buffer("std", th.ones(obs_dim))
 
-    def fit_scale(self, states: th.Tensor) -> None:
-        """Take over how states are spread.
-
-        :param states: (M, obs_dim)
-        """
-        std, mean = th.std_mean(states, dim=0)
+    def fit_scale(self, source: WindowSource) -> None:
+        """Take over how states are spread."""
+        std, mean = th.std_mean(source.start_states().to(self.mean.device), dim=0)
         self.mean.copy_(mean)
         self.std.copy_(th.where(std > 1e-6, std, 1.0))
 
@@ -100,13 +97,11 @@ class RolledOutModel(LearnedBelief):
         super().__init__(obs_dim, max_delay)
         self.model = OneStepModel(obs_dim, act_dim)
 
-    def fit_scale(self, states: th.Tensor) -> None:
-        """Take over how states and their moves are spread, so that small moves count as much as large ones.
-
-        :param states: (M, obs_dim), in the order of time; the few moves between episodes are outliers
-        """
-        super().fit_scale(states)
-        moves = self._z(states).diff(dim=0).abs().median(0).values
+    def fit_scale(self, source: WindowSource) -> None:
+        """Take over how states and their moves are spread, so that small moves count as much as large ones."""
+        super().fit_scale(source)
+        steps = source.gather(th.arange(len(source), device=source.rows.device), 2).to(self.mean.device)
+        moves = self._z(steps.states)[steps.valid[:, 1]].diff(dim=1)[:, 0].abs().median(0).values
         self.model.move_std.copy_(th.where(moves > 1e-6, moves, 1.0))
 
     def present(self, state: th.Tensor, action_history: th.Tensor, delay: th.Tensor) -> th.Tensor:
@@ -174,7 +169,7 @@ def train_belief(
     :param progress_bar: show one
     """
     device, generator = belief.mean.device, th.Generator().manual_seed(seed)
-    belief.fit_scale(source.start_states().to(device))
+    belief.fit_scale(source)
     optimizer = th.optim.Adam(belief.parameters(), belief.learning_rate)
     scheduler = th.optim.lr_scheduler.CosineAnnealingLR(optimizer, gradient_steps)
     for _ in tqdm(range(gradient_steps), desc=type(belief).__name__, disable=not progress_bar):

@@ -236,6 +236,7 @@ class DQL(OfflineAlgorithm):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": DQLPolicy, "MultiInputPolicy": DQLPolicy}
+    settings_arguments = ("diffusion_kwargs",)
     policy: DQLPolicy
     actor: DiffusionActor
 

@@ -12,6 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, Conve
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import configure_logger
 
+from sb3_said.delays.space import ages_of
 from sb3_said.offline.datasets import load_dataset
 from sb3_said.sac import DelayedSAC
 
@@ -60,6 +61,8 @@ class OfflineAlgorithm(DelayedSAC):
                 f"{type(self).__name__} learns at the ages that a DelayedObservationWrapper gives, and has none: give "
                 "it the environment, with load(..., env=env) or set_env(env). It is not stepped."
             )
+        if self.env is not None:
+            self.trained_ages = ages_of(self.env)
         watcher = self._begin_offline(dataset, gradient_steps, callback, tb_log_name, reset_num_timesteps, progress_bar)
         watcher.on_training_start(locals() | {"total_timesteps": self._total_timesteps, "callback": watcher}, globals())
         while self.num_timesteps < self._total_timesteps:
@@ -134,9 +137,9 @@ class OfflineAlgorithm(DelayedSAC):
     def _draw_ages(self) -> Callable[[int], np.ndarray] | None:
         """Return how to draw the ages of an episode, as its environment's receiver and actuator do in play."""
         is_delayed = isinstance(self.observation_space, spaces.Dict)
-        if self.env is None or not is_delayed or not self.env.has_attr("receiver"):
+        if self.env is None or not is_delayed or not self.env.has_attr("age_range"):
             return None
-        receiver, actuator = (self.env.get_attr(name, 0)[0] for name in ("receiver", "actuator"))
+        receiver, actuator = self.env.env_method("make_receivers", indices=0)[0]
         rng = np.random.default_rng(self.seed)
 
         def step() -> int:

@@ -175,17 +175,18 @@ class DelayedSAC(SafeSaveMixin, SAC):
     def borrowed_env(self) -> Iterator[VecEnv]:
         """Hand out the training environment for steps that teach nothing.
 
-        ``VecNormalize`` keeps its statistics, and the files of SB3's ``Monitor`` the episodes of training alone, but
-        for environments in other processes. Learning, where it goes on, begins with a new episode.
+        ``VecNormalize`` keeps its statistics and leaves rewards as they are, and the files of SB3's ``Monitor`` keep
+        the episodes of training alone, but for environments in other processes. Learning, where it goes on, begins with
+        a new episode.
         """
         assert self.env is not None
         envs = getattr(self.env.unwrapped, "envs", [])
         monitors = [m for env in envs if isinstance(m := unwrap_wrapper(env, Monitor), Monitor)]
         writers = [monitor.results_writer for monitor in monitors]
         normalizer = self._vec_normalize_env
-        was_training = normalizer is not None and normalizer.training
+        before = None if normalizer is None else (normalizer.training, normalizer.norm_reward)
         if normalizer is not None:
-            normalizer.training = False
+            normalizer.training = normalizer.norm_reward = False
         for monitor in monitors:
             monitor.results_writer = None
         try:
@@ -194,8 +195,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
             for monitor, writer in zip(monitors, writers, strict=True):
                 monitor.results_writer = writer
             self._last_obs = None  # SB3 then resets the environments
-            if normalizer is not None:
-                normalizer.training = was_training
+            if normalizer is not None and before is not None:
+                normalizer.training, normalizer.norm_reward = before
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Take another environment, as SB3 does; see :meth:`check_ages` for one with another delay.

@@ -63,8 +63,9 @@ class StateNormalizer(nn.Module):
 
     def fit(self, states: th.Tensor, n_steps: int) -> None:
         """Take mean and standard deviation of states, (N, obs_dim), which were replayed at this environment step."""
-        self.mean.copy_(states.mean(0))
-        self.deviation.copy_(states.std(0, correction=0) + SMALLEST_DEVIATION)
+        variance, mean = th.var_mean(states, dim=0, correction=0)  # a mean alone is off where an entry never moves
+        self.mean.copy_(mean)
+        self.deviation.copy_(variance.sqrt() + SMALLEST_DEVIATION)
         self.fitted_at.fill_(float(n_steps))
 
     def forward(self, states: th.Tensor) -> th.Tensor:

@@ -94,11 +94,10 @@ class StableSAC(DelayedSAC):
         }
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        before = self._last_obs
         learn = super()._setup_learn(*args, **kwargs)
-        self._running_returns = np.zeros(self.n_envs)
-        normalizer = self.policy.state_normalizer
-        if normalizer is not None and self.num_timesteps < float(normalizer.fitted_at):
-            normalizer.fitted_at.zero_()  # steps are counted anew, as of another task
+        if self._last_obs is not before:  # the environments were reset
+            self._running_returns = np.zeros(self.n_envs)
         return learn
 
     def _sample_action(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -121,10 +120,19 @@ class StableSAC(DelayedSAC):
             self._running_returns = self._running_returns * (1 - dones)
 
     def _look_at_states(self) -> None:
-        """Take the statistics of the states in replay, unless they are hardly more than last time."""
+        """Take the statistics of the states in replay, unless they are hardly more than last time, or fewer.
+
+        The networks have learned in these units: from the few states of a replay that an agent without its own begins,
+        at first those of random actions, they would see another task (measured, results/stable_expert.md).
+        """
         normalizer = self.policy.state_normalizer
-        if normalizer is not None and self.num_timesteps >= REFIT_GROWTH * float(normalizer.fitted_at):
-            n_states = min(STATES_LOOKED_AT, self.replay_buffer.size() * self.n_envs)
+        if normalizer is None:
+            return
+        replay, fitted_at = self.replay_buffer, float(normalizer.fitted_at)
+        has_as_many = replay.size() * self.n_envs >= min(fitted_at, replay.buffer_size * self.n_envs)
+        is_counted_anew = self.num_timesteps < fitted_at
+        if has_as_many and (is_counted_anew or self.num_timesteps >= REFIT_GROWTH * fitted_at):
+            n_states = min(STATES_LOOKED_AT, replay.size() * self.n_envs)
             seen = self.replay_buffer.sample(n_states, env=self._vec_normalize_env).observations
             normalizer.fit(seen[UNDELAYED] if isinstance(seen, dict) else seen, self.num_timesteps)
 
@@ -136,6 +144,8 @@ class StableSAC(DelayedSAC):
             polyak_update(self.actor.parameters(), self.policy.averaged_actor.parameters(), 1.0 - decay)
             own, averaged = self._running_stats
             polyak_update(own, averaged, 1.0)
+            if self.use_sde:
+                self.policy.averaged_actor.reset_noise()  # of the spread that it has learned by now
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Update critics, and every ``policy_delay`` steps actor and entropy coefficient, on batches from replay."""

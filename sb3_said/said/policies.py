@@ -327,6 +327,7 @@ class SAIDPolicy(DelayedSACPolicy):
         n = len(observation[KEYS[0]] if isinstance(observation, dict) else observation)
         return th.full((n,), who == "expert", device=self.device)
 
+    @th.no_grad()
     def predict_plan(self, observation: np.ndarray | dict[str, np.ndarray], deterministic: bool = False) -> np.ndarray:
         """Return the action that :meth:`predict` does, and those planned for the steps after it.
 

@@ -75,6 +75,7 @@ class SAID(OfflineAlgorithm, StableSAC):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": SAIDPolicy, "MultiInputPolicy": SAIDPolicy}
     counters = (*OfflineAlgorithm.counters, "_planner_trained_at")
+    settings_arguments = ("planner_kwargs", "iql_kwargs")
     policy: SAIDPolicy
 
     def __init__(

@@ -13,7 +13,6 @@ from huggingface_hub import EvalResult, ModelCard, ModelCardData
 
 from sb3_said import SAID
 from sb3_said.delays.space import written_ages
-from sb3_said.delays.text import age_range
 from sb3_said.zoo.arguments import explained, make_parser
 from sb3_said.zoo.cells import Cell, Results, average
 from sb3_said.zoo.over_delays import digest_of
@@ -178,11 +177,10 @@ def describe(
 
 
 def ages_trained_on(run: LoadedRun, record: Record) -> list[int]:
-    """Return the ages that an agent has met; one of logs is shown all that its delay brings."""
-    if not record.dataset:
-        return run.model.trained_ages or []  # type: ignore[attr-defined]  # all of ours have them
-    low, high = age_range(0 if record.delay is None else record.delay)
-    return [*range(0 if isinstance(run.model, SAID) else low, high + 1)]  # its planner learns all masks
+    """Return the ages that an agent has met; a planner of logs has drawn them all."""
+    if isinstance(run.model, SAID) and record.dataset:
+        return [*range(run.model.policy.max_delay + 1)]
+    return run.model.trained_ages or []  # type: ignore[attr-defined]  # all of ours have them
 
 
 def who_answers(model: Any) -> str:

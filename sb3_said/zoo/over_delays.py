@@ -259,7 +259,7 @@ def obstacle(run: LoadedRun, answer: str | None, delay: int | str) -> str | None
         return f"it was built for delays 0..{longest}{added}"
     if answer not in (None, "expert"):
         try:
-            model.policy.planner.check_ages(list(range(low, high + 1)))  # type: ignore[union-attr]  # it has one
+            model.policy.planner.check_ages(list(range(low, high + 1)))  # type: ignore[union-attr,operator]
         except ValueError as error:
             return str(error).removesuffix(".")
     return None

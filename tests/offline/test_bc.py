@@ -10,10 +10,11 @@ from gymnasium import spaces
 from small_task import Drift, delayed
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 from torch.nn import functional as F
 
 from sb3_said import DelayedObservationWrapper
+from sb3_said.delays import UniformDelay
 from sb3_said.offline import BC, Dataset
 from sb3_said.offline.learning import GradientStepBar
 
@@ -98,6 +99,34 @@ def test_ages_count_the_actions_on_their_way_as_play_does():
         played += [int(env.step(env.action_space.sample())[0]["delay"][0]) for _ in range(40)]
         assert ages == played
     assert {1, 2, 3} == {age for ages in drawn for age in ages[3:]}
+
+
+@pytest.mark.parametrize("vec_env", [DummyVecEnv, SubprocVecEnv])
+def test_the_ages_of_logs_are_no_matter_of_an_episode_that_is_played(vec_env):
+    env = vec_env([lambda: DelayedObservationWrapper(Drift(), UniformDelay(0, 2), UniformDelay(0, 1))])
+    try:
+        model = make(env)
+        env.seed(3)
+        shown = env.reset()
+        env.seed(3)
+        env.reset()
+        model.learn_offline(demonstrations(2), 1)  # amid the episode
+        twin = DummyVecEnv([lambda: DelayedObservationWrapper(Drift(), UniformDelay(0, 2), UniformDelay(0, 1))])
+        twin.seed(3)
+        np.testing.assert_array_equal(twin.reset()["observation"], shown["observation"])
+        for _ in range(9):
+            left, right = (each.step(np.ones((1, 1), np.float32))[0] for each in (env, twin))
+            for key in left:
+                np.testing.assert_array_equal(left[key], right[key])
+    finally:
+        env.close()
+
+
+def test_ages_that_logs_did_not_show_are_warned_of():
+    model = make(DelayedObservationWrapper(Drift(), (1, 2), max_delay=4)).learn_offline(demonstrations(2), 1)
+    assert model.trained_ages == [1, 2]
+    with pytest.warns(UserWarning, match="BC learned at ages 1, 2 and is given 4"):
+        model.set_env(DummyVecEnv([lambda: DelayedObservationWrapper(Drift(), 4)]))
 
 
 def test_without_an_environment_ages_are_unknown(learned, tmp_path):

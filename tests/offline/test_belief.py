@@ -1,8 +1,11 @@
 """Beliefs of the present: right where they can be, compounding where they are rolled out, and acted on."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch as th
+from linear_system import make_source
 from small_planner import make_batch, make_planner
 from small_task import Drift, delayed
 from test_bc import demonstrations
@@ -96,9 +99,20 @@ def test_a_planners_belief_repeats_and_keeps_what_is_known():
     assert th.equal(guessed[0], state[0]) and (guessed[delay > 0] - present[delay > 0]).abs().min(1).values.max() > 1e-3
 
 
-def test_an_entry_that_never_moves_stays_finite():
+def test_moves_are_those_within_episodes_whatever_stands_side_by_side():
+    """Episodes far apart, a step in each of three environments in a row."""
+    source = make_source(3, 20)
+    apart = source.states.clone()
+    apart[..., 0] = 0.01 * th.arange(20.0)[:, None] + 100 * th.arange(3.0)
     belief = RolledOutModel(2, 1, DELAY)
-    belief.fit_scale(th.stack([th.arange(9.0), th.full((9,), 4.0)], dim=1))
+    belief.fit_scale(replace(source, states=apart))
+    th.testing.assert_close(belief.model.move_std[0], 0.01 / belief.std[0], rtol=1e-2, atol=0)
+
+
+def test_an_entry_that_never_moves_stays_finite():
+    belief, source = RolledOutModel(2, 1, DELAY), make_source(1, 9)
+    states = th.stack([th.arange(9.0), th.full((9,), 4.0)], dim=1)[:, None]
+    belief.fit_scale(replace(source, states=states))
     assert belief.model.move_std[1] == 1.0 and belief.model.move_std[0] > 0
     assert belief.present(th.tensor([[3.0, 4.0]]), th.zeros(1, DELAY, 1), th.tensor([DELAY])).isfinite().all()
 

@@ -223,6 +223,8 @@ def test_it_learns_is_saved_and_repeats(delay, tmp_path):
     np.testing.assert_array_equal([model.predict(row, deterministic=True)[0] for row in rows], answer)
     assert not np.array_equal(model.predict(obs)[0], model.predict(obs)[0])  # it is a distribution
     assert model.policy.config == loaded.policy.config and loaded._n_updates == 4
+    other = DQL.load(tmp_path / "dql.zip", device="cpu", diffusion_kwargs={"eta": 3.0})
+    assert other.policy.config == DQLConfig(**SMALL, ema_start=2, ema_every=1, eta=3.0)
 
 
 def test_only_with_state_augmentation_it_reads_the_actions_since():

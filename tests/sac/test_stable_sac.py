@@ -69,6 +69,14 @@ def test_states_are_scored():
     assert normalizer(th.full((1, 3), 1e6)).max() == 10  # an entry that never moved, and then does
 
 
+@pytest.mark.parametrize("constant", [1000.1, 12345.678, -3e-3])
+@pytest.mark.parametrize("n", [137, 1000, 9999])
+def test_an_entry_that_never_moves_is_scored_0(constant, n):
+    normalizer, states = StateNormalizer(1), th.full((n, 1), constant)
+    normalizer.fit(states, n)
+    assert normalizer(states).abs().max() < 0.01
+
+
 # --------------------------------------------------------------------------------------------------------- learning
 
 
@@ -123,6 +131,31 @@ def test_states_are_looked_at_where_critics_see_them():
     model.replay_buffer.sample = apart
     model._look_at_states()
     th.testing.assert_close(model.policy.state_normalizer.mean, apart.mean)
+
+
+@pytest.mark.parametrize("anew", [True, False])
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_an_agent_without_its_replay_keeps_its_scales_until_it_has_seen_as_much_again(anew, n_envs, tmp_path):
+    """Else its networks would read the states of random actions, or of few, in units that they have not learned in."""
+    model = make(make_vec_env(lambda: delayed(3), n_envs)).learn(90)
+    model.save(tmp_path / "agent.zip")
+    loaded = StableSAC.load(tmp_path / "agent.zip", env=make_vec_env(lambda: delayed(3), n_envs), device="cpu")
+    normalizer = loaded.policy.state_normalizer
+    fitted_at, mean = float(normalizer.fitted_at), normalizer.mean.clone()
+    assert fitted_at > 60
+    loaded.learn(60, reset_num_timesteps=anew)
+    assert loaded._n_updates > model._n_updates and th.equal(normalizer.mean, mean)
+    loaded.learn(60, reset_num_timesteps=False)
+    assert not th.equal(normalizer.mean, mean) and normalizer.deviation.min() > 0.05
+    assert normalizer.fitted_at <= loaded.num_timesteps
+
+
+def test_a_running_return_goes_on_where_its_episode_does():
+    whole = make(delayed(1, length=40), gamma=0.9, learning_starts=1000).learn(40)
+    chunks = make(delayed(1, length=40), gamma=0.9, learning_starts=1000)
+    for _ in range(10):
+        chunks.learn(4, reset_num_timesteps=False)
+    assert chunks.policy.return_scale.value == whole.policy.return_scale.value > 1
 
 
 def test_a_new_training_s_returns_begin_with_its_episodes():
@@ -211,9 +244,10 @@ def test_state_dependent_exploration_is_drawn_anew_for_each_batch_and_answer():
     model.train(3, 16)
     assert len(drawn) == 3
     average = model.policy.averaged_actor.action_dist
-    before = average.exploration_mat.clone()
-    model.policy.reset_noise()
-    assert not th.equal(average.exploration_mat, before)
+    for draw in (model.policy.reset_noise, lambda: model.train(2, 16)):  # whose average has learned another spread
+        before = average.exploration_mat.clone()
+        draw()
+        assert not th.equal(average.exploration_mat, before)
 
 
 def test_the_actor_is_slower():

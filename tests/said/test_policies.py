@@ -526,3 +526,15 @@ def test_every_age_at_which_the_expert_answers_comes_back_from_its_part():
         assert policy.expert_ages == range(age + 1)
         policy.set_answer("both", expert_from=age + 1)
         assert policy.expert_ages == range(age + 1, 41)
+
+
+@pytest.mark.parametrize("how", ["actor", "both"])
+def test_a_plan_whose_first_action_is_the_actor_s_own(how):
+    """Without an average, whose weights would take no gradient."""
+    model, obs = make(delayed((0, 2)), actor_averaging=0.0).learn(60), observe()
+    if how == "actor":
+        model.set_planner(decided_by="actor")
+    else:
+        model.set_answer("both", expert_up_to=1)
+    plan = model.predict_plan(obs, deterministic=True)
+    np.testing.assert_allclose(plan[:, 0], answer(model, obs), rtol=1e-5, atol=1e-6)

@@ -306,6 +306,15 @@ def test_a_file_brings_its_settings_whatever_the_defaults_are_then(trained, save
     assert np.array_equal(answer(loaded, observe()), answer(trained, observe()))
 
 
+def test_settings_that_are_given_to_load_leave_the_others_as_the_file_has_them(tmp_path):
+    own = {"relative_states": False, "prediction": "epsilon"}
+    model = make(planner_kwargs=own).learn(60)
+    model.save(tmp_path / "agent")
+    loaded = SAID.load(tmp_path / "agent", device="cpu", planner_kwargs={"n_candidates": 9}, iql_kwargs={"updates": 5})
+    assert loaded.policy.planner.config == PlannerConfig(**PLANNER | own | {"n_candidates": 9})
+    assert loaded.iql_kwargs == asdict(IQLConfig(updates=5))
+
+
 def test_only_an_untrained_planner_may_be_of_other_settings(trained, tmp_path):
     expert, deeper = make(seed=4), make(planner_kwargs={"depth": 2})
     expert.save(tmp_path / "expert")

@@ -294,6 +294,13 @@ def test_the_trial_is_no_training(monkeypatch):
     assert model.num_timesteps == 80
 
 
+def test_returns_are_in_the_task_s_own_rewards_without_a_monitor_too():
+    env = VecNormalize(DummyVecEnv([lambda: delayed()]), norm_obs_keys=["observation"])
+    model = make(env=env).learn(60)
+    np.testing.assert_allclose(trial.play_trial(model, n_episodes=2).returns["expert"], 12.0)  # 1 a step
+    assert env.norm_reward
+
+
 def test_only_the_last_training_of_many_is_tried(monkeypatch):
     """While collection goes on its episode must not be cut."""
     calls, played = [], trial.Trial({"planner": np.ones(1), "expert": np.zeros(1)}, np.full(1, 2.0), 7)
