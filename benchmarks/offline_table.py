@@ -1,7 +1,7 @@
 """Agents that learned from logs, over delays and planner seeds: a table and plots beside the paper's Table 2.
 
     python benchmarks/offline_table.py medium=results/offline/hopper-medium-0.json \\
-        mixed,DQL+SA=results/offline/hopper-mixed-dql.json --plot results/offline
+        mixed,DQL+SA=results/nine_logs/hopper-mixed-0-dql.json --plot results/offline
 
 Each file is of motivation.py (its players, of one planner seed), or of sb3-said over-delays (one agent, which is named
 after the comma). Files of one task, set and name are seeds of the same training.

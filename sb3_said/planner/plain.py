@@ -36,7 +36,8 @@ def residual_network(n_in: int, n_out: int, width: int, n_blocks: int) -> nn.Seq
 class OneStepModel(nn.Module):
     """Predicts the state that follows an action, as a difference from the one before, in units of its usual moves.
 
-    Four residual blocks are a quarter nearer than two plain layers (measured, results/what_diffusion_buys.md).
+    Four residual blocks are a quarter nearer than two, and more than that nearer than two plain layers (measured,
+    results/what_diffusion_buys.md, results/nine_logs.md).
     """
 
     learning_rate = 2e-3  # of Adam, results/nine_logs.md has others
