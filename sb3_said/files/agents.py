@@ -8,8 +8,11 @@ import math
 import os
 import pathlib
 import warnings
+from collections.abc import Iterable
+from difflib import get_close_matches
 from typing import Any, ClassVar, TypeVar
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -113,14 +116,16 @@ class SafeSaveMixin(OffPolicyAlgorithm):
         :param custom_objects: constructor arguments to take instead of those in the file; other names are ignored
         :param force_reset: has no effect, as learning always starts a new episode after loading
         :param kwargs: constructor arguments to take instead of those in the file
+        :raises TypeError: for arguments that the constructor does not have
         :raises SavedFileError: if the file is damaged, foreign, forged, newer than this package or of another class,
             or does not go with the environment or the arguments
         """
-        path = _existing(path)
+        path = existing(path)
         if print_system_info:
             get_system_info()
             print("Saved with", load_metadata(path)["versions"])
         names = cls._argument_names()
+        cls._refuse_unknown(kwargs, names | {"tensorboard_log"})
         given = {name: value for name, value in (custom_objects or {}).items() if name in names}
         saved = load_tree(path, cls.__name__)
         with readable(path):
@@ -187,7 +192,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
         if isinstance(load_path_or_dict, dict):
             super().set_parameters(self._adapt_parameters(load_path_or_dict), exact_match, device)
             return
-        path = _existing(load_path_or_dict)
+        path = existing(load_path_or_dict)
         saved = load_tree(path, kind=None)
         with readable(path):
             _take_parameters(self, _fitting_parameters(self, saved["parameters"], exact_match), exact_match)
@@ -209,6 +214,15 @@ class SafeSaveMixin(OffPolicyAlgorithm):
                 parameters = inspect.signature(base).parameters.values()
                 names |= {p.name for p in parameters if p.kind is not p.VAR_KEYWORD}
         return names - {"self", "policy", "env", "device", "tensorboard_log", "_init_setup_model"}
+
+    @classmethod
+    def _refuse_unknown(cls, given: Iterable[str], known: set[str]) -> None:
+        """:raises TypeError: for an argument that is none of those known, with the nearest name of all there are"""
+        for unknown in sorted(set(given) - known):
+            names = sorted((cls._argument_names() | {"device", "tensorboard_log"}) - {"policy_class"})
+            nearest = get_close_matches(unknown, names, n=1)
+            hint = f"did you mean {nearest[0]}?" if nearest else f"it has {', '.join(names)}."
+            raise TypeError(f"{cls.__name__} has no argument {unknown}; {hint}")
 
     def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:
         """Return the state dicts to take over from those given; an algorithm may keep some of its own."""
@@ -268,10 +282,17 @@ def agent_state(model: SafeSaveMixin) -> dict[str, Any]:
     """Return what learning has changed, as a tree; of optimizers only the state, as their settings are arguments."""
     parameters = model.get_parameters()
     return {
-        "counters": {name: getattr(model, name) for name in model.counters},
+        "counters": {name: _plain(name, getattr(model, name)) for name in model.counters},
         "parameters": {name: part["state"] if "param_groups" in part else part for name, part in parameters.items()},
         "variables": {name: getattr(model, name).detach() for name in model._get_torch_save_params()[1]},
     }
+
+
+def _plain(name: str, value: Any) -> Any:
+    """Return a counter as a file has it: ``learn(1e6)`` and NumPy's numbers leave others."""
+    value = value.item() if isinstance(value, np.generic) else value
+    is_count = name != "_current_progress_remaining" and isinstance(value, float) and value.is_integer()
+    return int(value) if is_count else value
 
 
 def restore_agent(model: SafeSaveMixin, saved: dict[str, Any]) -> None:
@@ -343,10 +364,13 @@ def _take_parameters(model: SafeSaveMixin, saved: dict[str, Any], exact: bool = 
             target.load_state_dict(state, strict=exact)
 
 
-def _existing(path: PathOrFile) -> PathOrFile:
-    """Add ``.zip`` where the path alone is no file, as SB3 does."""
+def existing(path: PathOrFile, suffix: str = ".zip") -> PathOrFile:
+    """Add a suffix where the path alone is no file, as SB3 does.
+
+    :raises FileNotFoundError: where neither is one
+    """
     if isinstance(path, (str, os.PathLike)) and not os.path.isfile(path):
-        path = f"{os.fspath(path)}.zip"
+        alone, path = os.fspath(path), f"{os.fspath(path)}{suffix}"
         if not os.path.isfile(path):
-            raise FileNotFoundError(f"There is no file '{path[:-4]}' and no '{path}'.")
+            raise FileNotFoundError(f"There is no file '{alone}' and no '{path}'.")
     return path

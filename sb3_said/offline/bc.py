@@ -61,6 +61,7 @@ class BC(OfflineAlgorithm):
             self.actor.optimizer.step()
             losses.append(loss.item())
         self._n_updates += gradient_steps
+        self.policy.forget_graph()
         self.policy.set_training_mode(False)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record_mean("train/action_error", float(np.mean(losses)))

@@ -232,7 +232,8 @@ class DQL(OfflineAlgorithm):
         have ``--lr_decay``, too, but its code makes 40 of the schedule's 2,000 steps: the rate loses 0.1 %
     :param diffusion_kwargs: fields of :class:`DQLConfig`
     :param sac_kwargs: every other argument of :class:`~sb3_said.sac.DelayedSAC`; batch size 256, gamma 0.99 and tau
-        0.005 are the paper's
+        0.005 are the paper's. Those of entropy and ``target_update_interval`` have no effect
+    :raises ValueError: as ``DelayedSAC`` does, and for gSDE, other than two critics, or a ``net_arch`` of the actor
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": DQLPolicy, "MultiInputPolicy": DQLPolicy}
@@ -251,6 +252,18 @@ class DQL(OfflineAlgorithm):
         delay_reconciled_critic: bool = False,
         **sac_kwargs: Any,
     ):
+        policy_kwargs = sac_kwargs.get("policy_kwargs") or {}
+        arch = policy_kwargs.get("net_arch")
+        if (
+            sac_kwargs.get("use_sde")
+            or policy_kwargs.get("n_critics", 2) != 2
+            or (isinstance(arch, dict) and "pi" in arch)
+        ):
+            raise ValueError(
+                "DQL has two critics and a diffusion actor of its own, got "
+                f"use_sde={sac_kwargs.get('use_sde', False)} and policy_kwargs={policy_kwargs}; leave use_sde and "
+                "n_critics out, and give the actor's width as diffusion_kwargs={'hidden': ...}."
+            )
         self.lr_decay = lr_decay
         self.diffusion_kwargs = diffusion_kwargs or {}
         sac_kwargs |= {"delay_reconciled_critic": delay_reconciled_critic}

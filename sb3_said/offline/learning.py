@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from gymnasium import spaces
@@ -32,6 +33,20 @@ class OfflineAlgorithm(DelayedSAC):
 
     The environment gives the spaces and the delay, and is neither reset nor stepped.
     """
+
+    learns_online: ClassVar[bool] = False
+
+    def learn(self: SelfOffline, *args: Any, **kwargs: Any) -> SelfOffline:
+        """Learn from the environment, where the subclass does.
+
+        :raises ValueError: where it learns from logs alone
+        """
+        if not self.learns_online:
+            raise ValueError(
+                f"{type(self).__name__} learns from logs: call learn_offline(dataset, gradient_steps), with logs such "
+                "as sb3-said collect makes."
+            )
+        return super().learn(*args, **kwargs)
 
     def learn_offline(
         self: SelfOffline,
@@ -96,6 +111,7 @@ class OfflineAlgorithm(DelayedSAC):
             self.num_timesteps = 0
         self._num_timesteps_at_start = self.num_timesteps
         self._total_timesteps = self.num_timesteps + gradient_steps
+        self.ep_info_buffer, self.ep_success_buffer = (deque(maxlen=self._stats_window_size) for _ in range(2))
         if not self._custom_logger:
             name = tb_log_name or type(self).__name__
             self._logger = configure_logger(self.verbose, self.tensorboard_log, name, reset_num_timesteps)

@@ -8,24 +8,32 @@ import pathlib
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from difflib import get_close_matches
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.env_util import unwrap_wrapper
+from stable_baselines3.common.env_util import is_wrapped, unwrap_wrapper
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn, Schedule
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    VecEnv,
+    VecMonitor,
+    unwrap_vec_normalize,
+    unwrap_vec_wrapper,
+)
 
-from sb3_said.delays.space import ages_of, check_one_max_delay, check_spaces, written_ages
-from sb3_said.files.agents import SafeSaveMixin
+from sb3_said.delays.space import WRAPPER_ORDER, ages_of, check_one_max_delay, check_spaces, written_ages
+from sb3_said.delays.wrapper import DelayedObservationWrapper
+from sb3_said.files.agents import SafeSaveMixin, existing
 from sb3_said.files.archive import load_tree, readable, save_tree
 from sb3_said.replay.buffer import DelayedReplayBuffer
 from sb3_said.sac.policies import DelayedSACPolicy, as_array
+
+SelfDelayedSAC = TypeVar("SelfDelayedSAC", bound="DelayedSAC")
 
 
 class DelayedSAC(SafeSaveMixin, SAC):
@@ -82,7 +90,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
         relabelled_ages: float = 0.5,
         **sac_kwargs: Any,
     ):
-        self._refuse_unknown(sac_kwargs)
+        self._refuse_unknown(sac_kwargs, set(inspect.signature(SAC).parameters))
         if sac_kwargs.get("n_steps", 1) != 1:
             raise ValueError(
                 f"DelayedSAC learns from one-step targets, got n_steps={sac_kwargs['n_steps']}; leave it 1."
@@ -92,23 +100,20 @@ class DelayedSAC(SafeSaveMixin, SAC):
         self.delay_reconciled_critic = delay_reconciled_critic
         self.relabelled_ages = relabelled_ages
         if isinstance(policy, str):  # SB3 takes one name for Box spaces and the other for Dict
-            policy = self.policy_aliases.get(policy, policy)  # type: ignore[assignment]
+            if policy not in self.policy_aliases:
+                raise ValueError(
+                    f"{type(self).__name__} has the policies {', '.join(self.policy_aliases)}, got {policy!r}; it reads "
+                    "a vector, such as gymnasium.wrappers.FlattenObservation makes of an image."
+                )
+            policy = self.policy_aliases[policy]  # type: ignore[assignment]  # a subclass names its own
         super().__init__(policy, env, learning_rate, learning_starts=learning_starts, **sac_kwargs)
-
-    def _refuse_unknown(self, sac_kwargs: dict[str, Any]) -> None:
-        """:raises TypeError: for an argument that SAC does not have either, with the nearest name of all there are"""
-        for unknown in sorted(set(sac_kwargs) - set(inspect.signature(SAC).parameters)):
-            names = sorted((self._argument_names() | {"device", "tensorboard_log"}) - {"policy_class"})
-            nearest = get_close_matches(unknown, names, n=1)
-            hint = f"did you mean {nearest[0]}?" if nearest else f"it has {', '.join(names)}."
-            raise TypeError(f"{type(self).__name__} has no argument {unknown}; {hint}")
 
     def _setup_model(self) -> None:
         name, policy_class = type(self).__name__, self.policy_aliases["MlpPolicy"]
         if not issubclass(self.policy_class, policy_class):
             raise ValueError(
-                f"{name} needs a {policy_class.__name__}, got {self.policy_class.__name__}; "
-                "load a file with the class that saved it."
+                f"{name} needs a {policy_class.__name__}, got {self.policy_class.__name__}: give 'MlpPolicy', or load "
+                "a file with the class that saved it."
             )
         self.replay_buffer_class = self.replay_buffer_class or DelayedReplayBuffer
         if not issubclass(self.replay_buffer_class, DelayedReplayBuffer):
@@ -137,6 +142,11 @@ class DelayedSAC(SafeSaveMixin, SAC):
     def _check_env(self, env: GymEnv) -> None:
         """Refuse spaces that are not served, and what no space tells of an environment, with a ``ValueError``."""
         check_spaces(env.observation_space, env.action_space)
+        if isinstance(env.observation_space, spaces.Box) and _is_delayed(env):
+            raise ValueError(
+                "A wrapper around DelayedObservationWrapper made one array of its observation, in which an agent finds "
+                f"neither age nor actions: {env.observation_space}. {WRAPPER_ORDER}"
+            )
         check_one_max_delay(env)
         vec_normalize = unwrap_vec_normalize(env)  # type: ignore[arg-type]  # None for one that is no VecEnv
         keys = [] if vec_normalize is None or not vec_normalize.norm_obs else vec_normalize.norm_obs_keys or []
@@ -149,6 +159,22 @@ class DelayedSAC(SafeSaveMixin, SAC):
     def _policy_flags(self) -> dict[str, Any]:
         """Return what the policy's constructor needs of this algorithm's own arguments."""
         return {"augment_state": self.augment_state, "delay_reconciled_critic": self.delay_reconciled_critic}
+
+    def learn(
+        self: SelfDelayedSAC,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 4,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfDelayedSAC:
+        """Learn as SB3 does.
+
+        :param tb_log_name: name of the run in TensorBoard, the class's by default
+        """
+        name = tb_log_name or type(self).__name__
+        return super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)  # type: ignore[arg-type]  # SB3 takes None
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         obs = self._last_obs if self._vec_normalize_env is None else self._last_original_obs
@@ -181,7 +207,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
         """
         assert self.env is not None
         envs = getattr(self.env.unwrapped, "envs", [])
-        monitors = [m for env in envs if isinstance(m := unwrap_wrapper(env, Monitor), Monitor)]
+        found = [unwrap_vec_wrapper(self.env, VecMonitor), *(unwrap_wrapper(env, Monitor) for env in envs)]
+        monitors = [monitor for monitor in found if isinstance(monitor, (Monitor, VecMonitor))]
         writers = [monitor.results_writer for monitor in monitors]
         normalizer = self._vec_normalize_env
         before = None if normalizer is None else (normalizer.training, normalizer.norm_reward)
@@ -263,12 +290,13 @@ class DelayedSAC(SafeSaveMixin, SAC):
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """Read what ``save_replay_buffer`` wrote into this agent's buffer, running no code from the file.
 
-        :param path: of the file, or a binary file object
+        :param path: of the file, with or without the ``.pkl`` that SB3's callbacks give it, or a binary file object
         :param truncate_last_traj: of SB3's ``HerReplayBuffer``, without effect here
         :raises SavedFileError: when the file is no replay, is damaged or forged, or was made with another task,
             ``buffer_size`` or ``n_envs``
         """
-        state = load_tree(path)  # type: ignore[arg-type]  # io.BufferedIOBase is IO
+        path = existing(path, ".pkl")  # type: ignore[arg-type,assignment]  # io.BufferedIOBase is IO
+        state = load_tree(path)  # type: ignore[arg-type]
         if self.replay_buffer is None:
             self.replay_buffer = self.replay_buffer_class(
                 self.buffer_size,
@@ -282,3 +310,10 @@ class DelayedSAC(SafeSaveMixin, SAC):
         with readable(path, explained=(ValueError,)):  # type: ignore[arg-type]
             self.replay_buffer.load_state_dict(state)
         self.replay_buffer.device = self.device
+
+
+def _is_delayed(env: Any) -> bool:
+    """Tell whether a ``DelayedObservationWrapper`` is somewhere in an environment, or in one of a ``VecEnv``."""
+    if isinstance(env, VecEnv):
+        return any(env.env_is_wrapped(DelayedObservationWrapper))
+    return is_wrapped(env, DelayedObservationWrapper)

@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
 from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
@@ -61,11 +63,14 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         self.average_actor = average_actor
         self.replay_space: spaces.Dict | None = None
         if isinstance(observation_space, spaces.Dict):
-            is_shared = policy_kwargs.get("share_features_extractor", False)
-            if is_shared or policy_kwargs.get("features_extractor_class", FlattenExtractor) is not FlattenExtractor:
+            own = {name: policy_kwargs.get(name) for name in ("share_features_extractor", "features_extractor_kwargs")}
+            if (
+                any(own.values())
+                or policy_kwargs.get("features_extractor_class", FlattenExtractor) is not FlattenExtractor
+            ):
                 raise ValueError(
                     "augment_state and delay_reconciled_critic set what actor and critics each read of a delayed "
-                    "observation; leave features_extractor_class and share_features_extractor out."
+                    f"observation; leave features_extractor_class, {' and '.join(own)} out."
                 )
             self.replay_space = spaces.Dict({**observation_space.spaces, UNDELAYED: state_space})
         super().__init__(observation_space, action_space, lr_schedule, **policy_kwargs)
@@ -92,6 +97,15 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
             yield
         finally:
             self._answers_as_average = before
+
+    def forget_graph(self) -> None:
+        """Drop the distribution of the actor's last batch, whose graph ``copy.deepcopy`` could not take.
+
+        That of gSDE holds its noise, too, and stays.
+        """
+        if not self.actor.use_sde:
+            fresh = SquashedDiagGaussianDistribution(get_action_dim(self.action_space))
+            self.actor.action_dist = fresh  # type: ignore[assignment]  # SB3 declares gSDE's, and has this
 
     def reset_noise(self, batch_size: int = 1) -> None:
         super().reset_noise(batch_size)

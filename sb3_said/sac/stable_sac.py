@@ -180,12 +180,10 @@ class StableSAC(DelayedSAC):
                 # Actor
                 actions, log_prob = self.actor.action_log_prob(batch.observations)
                 log_prob = log_prob.reshape(-1, 1)  # (B, 1)
-                self.critic.requires_grad_(False)
                 value = th.cat(self.critic(batch.observations, actions), dim=1).amin(1, keepdim=True)  # (B, 1)
-                self.critic.requires_grad_(True)
                 actor_loss = (ent_coef * log_prob - value).mean()
                 self.actor.optimizer.zero_grad()
-                actor_loss.backward()
+                actor_loss.backward(inputs=[p for p in self.actor.parameters() if p.requires_grad])
                 self.actor.optimizer.step()
                 self._average_actor()
                 losses["actor_loss"].append(actor_loss.item())
@@ -203,6 +201,7 @@ class StableSAC(DelayedSAC):
                 polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
                 polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 
+        self.policy.forget_graph()
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/ent_coef", float(self._ent_coef()))
         self.logger.record("train/reward_scale", float(scale))

@@ -76,6 +76,7 @@ class SAID(OfflineAlgorithm, StableSAC):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": SAIDPolicy, "MultiInputPolicy": SAIDPolicy}
     counters = (*OfflineAlgorithm.counters, "_planner_trained_at")
     settings_arguments = ("planner_kwargs", "iql_kwargs")
+    learns_online = True
     policy: SAIDPolicy
 
     def __init__(
@@ -96,21 +97,18 @@ class SAID(OfflineAlgorithm, StableSAC):
         student_width: int | None = None,
         **sac_kwargs: Any,
     ):
-        counts = {"gradient_steps": planner_gradient_steps, "train_freq": planner_train_freq}
-        for name, count in {**counts, "trial_episodes": planner_trial_episodes}.items():
-            least = 0 if name == "trial_episodes" else 1
-            if count is not None and (count < least or count % 1 != 0):
-                raise ValueError(f"planner_{name} must be a whole number, at least {least}, got {count}.")
         if not 0.0 < planner_newest_fraction <= 1.0:
             raise ValueError(
                 f"planner_newest_fraction is a part of the buffer in (0, 1], got {planner_newest_fraction}."
             )
         self._given_planner_kwargs = planner_kwargs or {}
-        self.planner_gradient_steps = int(planner_gradient_steps)  # 1e4 is a float in YAML and in -params
-        self.planner_train_freq = None if planner_train_freq is None else int(planner_train_freq)
+        self.planner_gradient_steps = _count("planner_gradient_steps", planner_gradient_steps)
+        self.planner_train_freq = (
+            None if planner_train_freq is None else _count("planner_train_freq", planner_train_freq)
+        )
         self.planner_newest_fraction = planner_newest_fraction
         self.planner_terminal_penalty = planner_terminal_penalty
-        self.planner_trial_episodes = int(planner_trial_episodes)
+        self.planner_trial_episodes = _count("planner_trial_episodes", planner_trial_episodes, least=0)
         self.planner_ways = ways_of(planner_ways, self._given_planner_kwargs, value)
         self.value = value
         self.iql_kwargs = asdict(settings_of(IQLConfig, iql_kwargs, "IQL"))
@@ -162,7 +160,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         total_timesteps: int,
         callback: MaybeCallback = None,
         log_interval: int | None = 4,
-        tb_log_name: str = "SAID",
+        tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfSAID:
@@ -179,7 +177,7 @@ class SAID(OfflineAlgorithm, StableSAC):
             return super().learn(
                 total_timesteps,
                 callbacks,
-                log_interval,  # type: ignore[arg-type]  # SB3 takes None and says so in its docstring
+                log_interval,
                 tb_log_name,
                 reset_num_timesteps,
                 progress_bar,
@@ -279,6 +277,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         :param gradient_steps: ``planner_gradient_steps`` by default
         :raises ValueError: when the buffer is empty, as it is after ``load``
         """
+        steps = self.planner_gradient_steps if gradient_steps is None else _count("gradient_steps", gradient_steps)
         replay, newest, env = self.replay_buffer, self.planner_newest_fraction, self._vec_normalize_env
         source = replay.window_source(newest, env)
         has_older = len(source) < replay.size() * replay.n_envs  # a log's replay has one, whatever the agent has
@@ -287,7 +286,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         return PlannerTrainer(
             self.policy.planner,
             replace(source, values=values),
-            self.planner_gradient_steps if gradient_steps is None else gradient_steps,
+            steps,
             held_out=HELD_OUT if len(source) > 1 else 0.0,
             seed=self.seed or 0,
             older=replay.window_source(newest, env, older=True) if has_older else None,
@@ -407,7 +406,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         :raises KeyboardInterrupt: when ``should_stop`` has ended the training
         :raises ValueError: as ``load_dataset`` and :meth:`train_planner` do
         """
-        total = self.planner_gradient_steps if gradient_steps is None else gradient_steps
+        total = self.planner_gradient_steps if gradient_steps is None else _count("gradient_steps", gradient_steps)
         self.planner_ways = ways_of(self.planner_ways, self.planner_kwargs, "iql")
         watcher = self._begin_offline(dataset, total, callback, tb_log_name, True, progress_bar)
         self.value, self.planner_newest_fraction = "iql", 1.0  # no step of a log is newer than another
@@ -437,3 +436,13 @@ class SAID(OfflineAlgorithm, StableSAC):
             raise KeyboardInterrupt
         watcher.on_training_end()
         return self
+
+
+def _count(name: str, given: float, least: int = 1) -> int:
+    """Return a count; 1e4 is a float in YAML and in -params.
+
+    :raises ValueError: for one below the least, or no whole number
+    """
+    if given < least or given % 1 != 0:
+        raise ValueError(f"{name} must be a whole number, at least {least}, got {given}.")
+    return int(given)

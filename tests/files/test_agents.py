@@ -24,7 +24,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_said import SAID, DelayedSAC
-from sb3_said.files.agents import agent_state
+from sb3_said.files.agents import agent_state, restore_agent
 from sb3_said.files.archive import SavedFileError, load_metadata, load_tree, save_tree
 from sb3_said.files.arguments import as_data, from_data, space_as_data, space_from_data
 from sb3_said.sac.policies import DelayedSACPolicy
@@ -229,8 +229,18 @@ def test_arguments_of_load(saved, trained, capsys):
         DelayedSAC.load(saved, env=gym.make("MountainCarContinuous-v0"), device="cpu")
     with pytest.raises(SavedFileError, match=r"'policy' does not fit: actor.* \(8, 3\).*expected .* \(3, 3\)"):
         DelayedSAC.load(saved, custom_objects={"policy_kwargs": {"net_arch": [3]}}, device="cpu")
-    with pytest.raises(ValueError, match="nonsense"):
-        DelayedSAC.load(saved, nonsense=1, device="cpu")
+    with pytest.raises(TypeError, match="DelayedSAC has no argument gama; did you mean gamma"):
+        DelayedSAC.load(saved, gama=1, device="cpu")
+
+
+@pytest.mark.parametrize("count", [6e1, np.int64(60), np.float32(60)])
+def test_an_agent_that_learned_a_number_of_any_type_of_steps_can_be_loaded(count, tmp_path):
+    """``learn(1e6)`` is how many write it."""
+    model = make_sac().learn(count)
+    model.save(tmp_path / "agent.zip")
+    loaded = DelayedSAC.load(tmp_path / "agent.zip", device="cpu")
+    assert loaded.num_timesteps == loaded._total_timesteps == 60 and type(loaded._total_timesteps) is int
+    restore_agent(make_sac(), agent_state(model))
 
 
 def test_set_parameters_from_a_file(saved, trained):

@@ -1,5 +1,6 @@
 """Behaviour cloning: it learns what the delay hides as far as history tells it, and steps no environment."""
 
+import copy
 import csv
 from dataclasses import replace
 
@@ -8,7 +9,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from small_task import Drift, delayed
-from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, LogEveryNTimesteps
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 from torch.nn import functional as F
@@ -127,6 +128,19 @@ def test_ages_that_logs_did_not_show_are_warned_of():
     assert model.trained_ages == [1, 2]
     with pytest.warns(UserWarning, match="BC learned at ages 1, 2 and is given 4"):
         model.set_env(DummyVecEnv([lambda: DelayedObservationWrapper(Drift(), 4)]))
+
+
+def test_it_does_not_clone_what_it_does_itself(learned):
+    with pytest.raises(ValueError, match=r"BC learns from logs: call learn_offline\(dataset, gradient_steps\)"):
+        learned.learn(100)
+
+
+def test_callbacks_that_log_episodes_find_none():
+    model = make()
+    model.set_logger(configure(format_strings=[]))
+    assert model.learn_offline(demonstrations(2), 9, LogEveryNTimesteps(4)).num_timesteps == 9
+    copied = copy.deepcopy(model)
+    assert copied.num_timesteps == 9
 
 
 def test_without_an_environment_ages_are_unknown(learned, tmp_path):

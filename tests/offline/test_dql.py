@@ -243,6 +243,15 @@ def test_critics_of_the_true_state_choose_nothing_in_play(monkeypatch):
 
 
 @pytest.mark.parametrize(
+    "given",
+    [{"use_sde": True}, {"policy_kwargs": {"n_critics": 3}}, {"policy_kwargs": {"net_arch": {"pi": [7], "qf": [9]}}}],
+)
+def test_arguments_of_another_actor_and_other_critics_are_refused(given):
+    with pytest.raises(ValueError, match="DQL has two critics and a diffusion actor of its own, got"):
+        make(**given)
+
+
+@pytest.mark.parametrize(
     ("setting", "message"),
     [
         ({"n_steps": 5}, "DQL has no setting n_steps; it has denoising_steps"),

@@ -22,7 +22,14 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.save_util import save_to_pkl
 from stable_baselines3.common.torch_layers import CombinedExtractor
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecExtractDictObs,
+    VecFrameStack,
+    VecNormalize,
+)
+from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.delays import TotalDelay, UniformDelay
@@ -476,6 +483,8 @@ ABOVE = "go below DelayedObservationWrapper"
 UNFIT = {
     "all normalised": (lambda: VecNormalize(make_vec_env(delayed)), r"norm_obs_keys=\['observation'\]"),
     "stacked": (lambda: VecFrameStack(make_vec_env(delayed), 3), ABOVE),
+    "one array": (lambda: gym.wrappers.FlattenObservation(delayed()), "made one array of its observation"),
+    "its observation alone": (lambda: VecExtractDictObs(make_vec_env(delayed), "observation"), "made one array of its"),
     "a plain task": (Drift, "task in a DelayedObservationWrapper.*max_delay=2"),
     "another max_delay": (lambda: delayed(3), "built for max_delay=2, but this environment has max_delay=3"),
     "a history of states": (lambda: DelayedObservationWrapper(Drift(), 2, state_history=True), "do not match"),
@@ -494,6 +503,42 @@ def test_an_environment_that_does_not_fit_is_not_taken(unfit, tmp_path):
     model.save(tmp_path / "agent")
     with pytest.raises(ValueError, match=message):
         DelayedSAC.load(tmp_path / "agent", env=make_env())
+
+
+@pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])
+def test_a_delay_is_seen_below_what_makes_one_array_of_its_observation(vec_env_cls):
+    vec = vec_env_cls([lambda: gym.wrappers.FlattenObservation(delayed())])
+    try:
+        with pytest.raises(ValueError, match=r"finds neither age nor actions.*go below DelayedObservationWrapper"):
+            make(vec)
+    finally:
+        vec.close()
+
+
+@pytest.mark.parametrize(
+    ("policy", "message"),
+    [("CnnPolicy", "has the policies MlpPolicy, MultiInputPolicy, got 'CnnPolicy'"), (SACPolicy, "give 'MlpPolicy'")],
+)
+def test_other_policies_are_refused_with_those_there_are(policy, message):
+    with pytest.raises(ValueError, match=message):
+        make(policy=policy)
+
+
+@pytest.mark.parametrize("cls", [DelayedSAC, SAID])
+def test_runs_in_tensorboard_have_the_algorithm_s_name(cls, tmp_path):
+    pytest.importorskip("tensorboard")
+    make(cls=cls, tensorboard_log=str(tmp_path)).learn(4)
+    assert [path.name for path in tmp_path.iterdir()] == [f"{cls.__name__}_1"]
+
+
+def test_a_replay_is_found_with_sb3_s_suffix_and_without(tmp_path):
+    model = make().learn(30)
+    model.save_replay_buffer(tmp_path / "replay.pkl")  # as SB3's CheckpointCallback names it
+    other = make()
+    other.load_replay_buffer(tmp_path / "replay")
+    assert other.replay_buffer.size() == 30
+    with pytest.raises(FileNotFoundError, match=r"no file '.*nothing' and no '.*nothing\.pkl'"):
+        other.load_replay_buffer(tmp_path / "nothing")
 
 
 def test_a_delayed_task_is_not_taken_where_there_was_none():
@@ -547,6 +592,7 @@ def test_wrappers_of_observations_go_below_ours(wrap):
         ({"optimize_memory_usage": True}, "optimize_memory_usage"),
         ({"policy_kwargs": {"share_features_extractor": True}}, "share_features_extractor"),
         ({"policy_kwargs": {"features_extractor_class": CombinedExtractor}}, "features_extractor_class"),
+        ({"policy_kwargs": {"features_extractor_kwargs": {"size": 3}}}, "features_extractor_kwargs"),
         ({"policy_kwargs": {"augment_state": False}}, "augment_state to DelayedSAC itself"),
         ({"relabelled_ages": 2.0}, r"in \[0, 1\]"),
         ({"replay_buffer_kwargs": {"relabelled_ages": 1.0}}, "relabelled_ages to DelayedSAC itself"),

@@ -81,6 +81,12 @@ def test_v_is_learned_as_told_and_a_file_keeps_how(tmp_path):
     assert learn(loaded, steps=1).policy.values.config == steps[0]  # it learns on as before
 
 
+def test_a_number_of_updates_may_be_written_as_a_float():
+    assert make().learn_offline(log(), 2.0).policy.planner_updates == 2
+    with pytest.raises(ValueError, match=r"gradient_steps must be a whole number, at least 1, got 2\.5"):
+        make().learn_offline(None, 2.5)
+
+
 def test_no_other_settings_of_v_are_taken():
     with pytest.raises(ValueError, match=r"IQL has no setting tau; it has expectile, hidden, .*updates"):
         make(iql_kwargs={"tau": 0.9})

@@ -339,8 +339,15 @@ def test_training_the_planner_of_a_loaded_agent(trained, saved, tmp_path):
     loaded.train_planner(3)
     assert loaded.policy.planner_updates == 3
     assert not np.array_equal(answer(loaded, observe()), before)
-    with pytest.raises(ValueError, match="gradient_steps >= 1"):
-        loaded.train_planner(0)
+
+
+def test_counts_of_later_trainings_may_be_written_as_floats_too():
+    model = make().learn(60)
+    model.train_planner(3.0)
+    assert model.policy.planner_updates == 3
+    for steps in (2.5, 0):
+        with pytest.raises(ValueError, match=f"gradient_steps must be a whole number, at least 1, got {steps}"):
+            model.train_planner(steps)
 
 
 def test_learning_no_steps_changes_nothing(saved):

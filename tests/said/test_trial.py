@@ -13,7 +13,7 @@ from small_task import delayed
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from sb3_said import SAID, DelayedObservationWrapper
 from sb3_said.delays import UniformDelay
@@ -84,6 +84,14 @@ def test_the_monitor_file_holds_the_training_and_not_the_trial(tmp_path):
     model.learn(30, reset_num_timesteps=False)
     rows = (tmp_path / "0.monitor.csv").read_text().splitlines()[2:]
     assert len(rows) == 4 + 2  # episodes of 15 steps
+
+
+def test_the_file_of_a_vec_monitor_holds_the_training_alone_too(tmp_path):
+    env = VecMonitor(DummyVecEnv([pendulum] * 2), str(tmp_path / "0"))
+    model = make(env=env, planner_trial_episodes=2).learn(60)
+    trial.play_trial(model, n_episodes=2)
+    model.learn(60, reset_num_timesteps=False)
+    assert len((tmp_path / "0.monitor.csv").read_text().splitlines()[2:]) == 2 * 2 + 2 * 2
 
 
 def test_a_way_that_the_planner_already_has_is_not_played_twice_and_the_way_back_is(trained):
