@@ -49,6 +49,8 @@ def replacing(target: PathOrFile) -> Iterator[IO[bytes]]:
             with scratch:
                 yield scratch
                 scratch.flush()
+                if path.exists():
+                    os.chmod(scratch.name, path.stat().st_mode)  # a file that others must not read stays so
                 os.fsync(scratch.fileno())
                 if fcntl is not None:  # while the lock is held: no other write takes it for abandoned
                     os.replace(scratch.name, path)

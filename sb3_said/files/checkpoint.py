@@ -77,7 +77,9 @@ class TrainingCheckpointCallback(BaseCallback):
         self._clock = CheckpointClock(self.path)
 
     def _on_training_start(self) -> None:
-        self._tried_at = self._saved_at = self.model.num_timesteps
+        self._tried_at = self.model.num_timesteps
+        if self._saved_at != self._tried_at:
+            self._saved_at = self._tried_at if self.path.exists() else -1
         self._clock.wait()
 
     def _on_rollout_start(self) -> None:
@@ -260,7 +262,7 @@ def restore_random_state(state: dict[str, Any]) -> None:
     np.random.set_state((name, keys, *rest))
     th.set_rng_state(state["torch"])
     if "cuda" in state and th.cuda.is_available():
-        th.cuda.set_rng_state_all(state["cuda"])
+        th.cuda.set_rng_state_all(state["cuda"][: th.cuda.device_count()])  # the machine before may have had more
 
 
 def _check_random_state(state: dict[str, Any]) -> None:

@@ -137,7 +137,11 @@ def no_larger_than(saved: dict[str, Any]) -> Iterator[None]:
             if left < 0:
                 raise SavedFileError("its arguments ask for larger networks than it holds parameters of")
 
-    with torch_hooks.register_module_parameter_registration_hook(count):
+    parameters, buffers = (
+        torch_hooks.register_module_parameter_registration_hook(count),
+        torch_hooks.register_module_buffer_registration_hook(count),
+    )
+    with parameters, buffers:
         yield
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable
 from typing import Any, ClassVar, TypeVar
@@ -35,6 +36,7 @@ class OfflineAlgorithm(DelayedSAC):
     """
 
     learns_online: ClassVar[bool] = False
+    _replays_logs = False  # since take_dataset
 
     def learn(self: SelfOffline, *args: Any, **kwargs: Any) -> SelfOffline:
         """Learn from the environment, where the subclass does.
@@ -46,6 +48,11 @@ class OfflineAlgorithm(DelayedSAC):
                 f"{type(self).__name__} learns from logs: call learn_offline(dataset, gradient_steps), with logs such "
                 "as sb3-said collect makes."
             )
+        if self._replays_logs:
+            warnings.warn(
+                "The agent collects steps of its own now: its replay no longer holds the dataset.", stacklevel=3
+            )
+            self.replay_buffer, self._replays_logs = self._new_replay_buffer(), False
         return super().learn(*args, **kwargs)
 
     def learn_offline(
@@ -149,6 +156,7 @@ class OfflineAlgorithm(DelayedSAC):
             device=self.device,
             relabelled_ages=self.relabelled_ages,
         )
+        self._replays_logs = True
 
     def _draw_ages(self) -> Callable[[int], np.ndarray] | None:
         """Return how to draw the ages of an episode, as its environment's receiver and actuator do in play."""

@@ -85,7 +85,8 @@ class Ledger:
         self._last = self.safe_action
         self._planned: dict[int, np.ndarray] = {}
         self._history = np.zeros((self.max_delay, *self.safe_action.shape), np.float32)
-        self._effects: deque[float] = deque(maxlen=LARGEST_COUNTED)  # when the newest actions took effect
+        # When the newest actions took effect
+        self._effects: deque[float] = deque(maxlen=max(LARGEST_COUNTED, self.max_delay + 1))
 
     @property
     def age(self) -> int:

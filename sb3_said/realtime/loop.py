@@ -115,7 +115,7 @@ class ControlLoop:
         self._is_busy, self._n_answers = True, 0  # a simulation's worker is never idle
         self._is_due = False  # to ask a busy worker when it has answered
         self._asked: Request | None = None  # what an idle one is asked
-        self._stands = False  # until the answer that is waited for
+        self._stands = False  # the robot, until the answer that is waited for or that was missed
         self._error: BaseException | None = None
         self._in_flight: tuple[Request, np.ndarray, int] | None = None  # of a simulation, and when it arrives
         if simulate is not None:
@@ -157,6 +157,7 @@ class ControlLoop:
         with self._changed:
             self._ledger.start_episode(began)
             self._is_due, self._has_heard, self._asked, self._in_flight = False, False, None, None
+            self._stands = False
             self._note(began)
             self._changed.notify_all()
 
@@ -216,6 +217,8 @@ class ControlLoop:
                 self._pretend(self._simulate)
             step = self._ledger.next_step()
             if step.n_missing > self._max_missing:
+                self._stands = True  # until an action is sent: answers are to begin with that one
+                self._ask()
                 raise NoAnswer(f"No action was planned for {step.n_missing} steps. Counted so far: {self._statistics}")
             self._count(step.n_missing, now)
             self._ledger.send(step, now)
@@ -329,7 +332,8 @@ class ControlLoop:
     def _pretend(self, busy_steps: Callable[[float], int]) -> None:
         """Be a worker that is busy for some steps, at the moment before an action is sent."""
         for may_ask in (True, False):
-            if self._in_flight is not None and self._in_flight[2] <= self.n_sent:
+            # While the robot stands no step goes by, by which an answer could be waited for
+            if self._in_flight is not None and (self._stands or self._in_flight[2] <= self.n_sent):
                 request, actions, _ = self._in_flight
                 self._in_flight = None
                 self._take(request, actions)
@@ -344,7 +348,7 @@ class ControlLoop:
         ledger = self._ledger
         if request.episode != ledger.episode:
             return
-        if ledger.n_sent > 0:  # before, the robot stands, and no step goes by however long an answer takes
+        if ledger.n_sent > 0 and not self._stands:  # else no step goes by however long an answer takes
             took = ledger.n_sent - request.n_sent
             self._statistics.count(answer_steps=took)
             self._took.append(took)

@@ -102,8 +102,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
         if isinstance(policy, str):  # SB3 takes one name for Box spaces and the other for Dict
             if policy not in self.policy_aliases:
                 raise ValueError(
-                    f"{type(self).__name__} has the policies {', '.join(self.policy_aliases)}, got {policy!r}; it reads "
-                    "a vector, such as gymnasium.wrappers.FlattenObservation makes of an image."
+                    f"{type(self).__name__} has the policies {', '.join(self.policy_aliases)}, got {policy!r}: it "
+                    "reads a vector, as gymnasium.wrappers.FlattenObservation makes of an image."
                 )
             policy = self.policy_aliases[policy]  # type: ignore[assignment]  # a subclass names its own
         super().__init__(policy, env, learning_rate, learning_starts=learning_starts, **sac_kwargs)
@@ -197,6 +197,19 @@ class DelayedSAC(SafeSaveMixin, SAC):
             if rollout is None or not rollout.continue_training:
                 self._last_obs = None
 
+    def _sample_action(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, np.ndarray]:
+        if self._last_obs is None:  # a callback has played the environment before this rollout, as a trial does
+            self._begin_episodes()
+        return super()._sample_action(*args, **kwargs)
+
+    def _begin_episodes(self) -> None:
+        """Reset the environments, as SB3 does where learning begins."""
+        assert self.env is not None
+        self._last_obs = self.env.reset()  # type: ignore[assignment]  # as in SB3
+        self._last_episode_starts = np.ones((self.env.num_envs,), dtype=bool)
+        if self._vec_normalize_env is not None:
+            self._last_original_obs = self._vec_normalize_env.get_original_obs()
+
     @contextmanager
     def borrowed_env(self) -> Iterator[VecEnv]:
         """Hand out the training environment for steps that teach nothing.
@@ -280,6 +293,19 @@ class DelayedSAC(SafeSaveMixin, SAC):
                 self.check_ages(sorted({int(age) for age in ages[history[:, 0].any(1)]}))
         return answer
 
+    def _new_replay_buffer(self) -> DelayedReplayBuffer:
+        """Return an empty replay of this agent's size and environments."""
+        made: Any = self.replay_buffer_class  # as _setup_model saw to
+        return made(
+            self.buffer_size,
+            self.observation_space,
+            self.action_space,
+            self.device,
+            self.n_envs,
+            relabelled_ages=self.relabelled_ages,
+            **self.replay_buffer_kwargs,
+        )
+
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """Write the replay buffer to a file without pickle.
 
@@ -298,15 +324,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
         path = existing(path, ".pkl")  # type: ignore[arg-type,assignment]  # io.BufferedIOBase is IO
         state = load_tree(path)  # type: ignore[arg-type]
         if self.replay_buffer is None:
-            self.replay_buffer = self.replay_buffer_class(
-                self.buffer_size,
-                self.observation_space,
-                self.action_space,
-                self.device,
-                self.n_envs,
-                relabelled_ages=self.relabelled_ages,
-                **self.replay_buffer_kwargs,
-            )
+            self.replay_buffer = self._new_replay_buffer()
         with readable(path, explained=(ValueError,)):  # type: ignore[arg-type]
             self.replay_buffer.load_state_dict(state)
         self.replay_buffer.device = self.device

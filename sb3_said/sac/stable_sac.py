@@ -100,6 +100,10 @@ class StableSAC(DelayedSAC):
             self._running_returns = np.zeros(self.n_envs)
         return learn
 
+    def _begin_episodes(self) -> None:
+        super()._begin_episodes()
+        self._running_returns = np.zeros(self.n_envs)
+
     def _sample_action(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, np.ndarray]:
         with self.policy.without_average():
             return super()._sample_action(*args, **kwargs)

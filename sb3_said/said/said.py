@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -256,7 +257,10 @@ class SAID(OfflineAlgorithm, StableSAC):
             except BaseException:
                 self.policy.student = before
                 raise
-        self.policy.student.requires_grad_(False)  # type: ignore[union-attr]  # just made
+        assert self.policy.student is not None  # just made
+        self.policy.student.requires_grad_(False)
+        if before is not None:
+            self.policy.student.preferred.copy_(before.preferred)
         self.student_width = width
         return error
 
@@ -407,17 +411,18 @@ class SAID(OfflineAlgorithm, StableSAC):
         :raises ValueError: as ``load_dataset`` and :meth:`train_planner` do
         """
         total = self.planner_gradient_steps if gradient_steps is None else _count("gradient_steps", gradient_steps)
-        self.planner_ways = ways_of(self.planner_ways, self.planner_kwargs, "iql")
-        watcher = self._begin_offline(dataset, total, callback, tb_log_name, True, progress_bar)
-        self.value, self.planner_newest_fraction = "iql", 1.0  # no step of a log is newer than another
-        self.policy.set_value("iql")
-        trainer, values = self.make_planner_trainer(total), self._make_value_trainer()
-        intervals = log_interval, eval_interval, save_interval
-        training = PlannerTraining(self, trainer, values, lambda n_updates: n_updates, folder, *intervals, watcher)
-        self.num_timesteps = trainer.n_updates
-        if not trainer.make_first_guess(progress_bar, should_stop):
-            raise KeyboardInterrupt
-        watcher.on_training_start(locals() | {"total_timesteps": total, "callback": watcher}, globals())
+        with self._as_before_if_it_fails():
+            self.planner_ways = ways_of(self.planner_ways, self.planner_kwargs, "iql")
+            watcher = self._begin_offline(dataset, total, callback, tb_log_name, True, progress_bar)
+            self.value, self.planner_newest_fraction = "iql", 1.0  # no step of a log is newer than another
+            self.policy.set_value("iql")
+            trainer, values = self.make_planner_trainer(total), self._make_value_trainer()
+            intervals = log_interval, eval_interval, save_interval
+            training = PlannerTraining(self, trainer, values, lambda n_updates: n_updates, folder, *intervals, watcher)
+            self.num_timesteps = trainer.n_updates
+            if not trainer.make_first_guess(progress_bar, should_stop):
+                raise KeyboardInterrupt
+            watcher.on_training_start(locals() | {"total_timesteps": total, "callback": watcher}, globals())
 
         is_new = True
 
@@ -436,6 +441,20 @@ class SAID(OfflineAlgorithm, StableSAC):
             raise KeyboardInterrupt
         watcher.on_training_end()
         return self
+
+    @contextmanager
+    def _as_before_if_it_fails(self) -> Iterator[None]:
+        """Take back what a training from logs changes before its first update, if it gets no further."""
+        names = "planner_ways", "replay_buffer", "_replays_logs", "num_timesteps", "value", "planner_newest_fraction"
+        before, policy = {name: getattr(self, name) for name in names}, self.policy
+        values, config = policy.values, policy.planner.config
+        try:
+            yield
+        except BaseException:
+            for name, value in before.items():
+                setattr(self, name, value)
+            policy.values, policy.planner.config = values, config
+            raise
 
 
 def _count(name: str, given: float, least: int = 1) -> int:

@@ -15,6 +15,7 @@ from tqdm.auto import tqdm
 from sb3_said.files.archive import load_tree, readable, save_tree
 from sb3_said.files.checkpoint import CheckpointClock, checksum, evaluations_of, restore_evaluations
 from sb3_said.offline.iql import IQL
+from sb3_said.planner.checks import check_same
 from sb3_said.planner.trainer import PlannerTrainer, worse_than_regression
 
 PLANNER_CHECKPOINT_NAME = "planner_checkpoint.zip"
@@ -54,11 +55,15 @@ class PlannerTraining:
         self._clock = None if folder is None else CheckpointClock(Path(folder) / PLANNER_CHECKPOINT_NAME)
         self.watcher = watcher
         self._data = {"num_timesteps": model.num_timesteps, "replay": checksum(model)}
+        self._weighed = {"gamma": model.gamma, "planner_terminal_penalty": model.planner_terminal_penalty}
+        self._weighed["value"] = model.value
         self._value_losses: dict[str, th.Tensor] = {}  # of the last update; read at log times only
         if self._clock is not None and self._clock.path.exists():
             state = load_tree(self._clock.path)
             with readable(self._clock.path, explained=(ValueError,)):
                 if {key: state[key] for key in self._data} == self._data:
+                    advice = "Give what it began with, or another folder."
+                    check_same("The planner's training was begun", state["weighed"], self._weighed, advice)
                     trainer.load_state_dict(state["trainer"])
                     if values is not None:
                         values.load_state_dict(state["values"])
@@ -157,7 +162,7 @@ class PlannerTraining:
     def _save_or_warn(self, clock: CheckpointClock) -> None:
         """Write a checkpoint; a full disk is no reason to lose the planner itself."""
         values = None if self.values is None else self.values.state_dict()
-        state = {**self._data, "trainer": self.trainer.state_dict(), "values": values}
+        state = {**self._data, "weighed": self._weighed, "trainer": self.trainer.state_dict(), "values": values}
         try:
             save_tree(clock.path, {**state, "evaluations": evaluations_of(self.watcher)})
         except OSError as error:

@@ -65,9 +65,20 @@ def ways_of(
                 f"planner_ways has {name!r}: {settings}; expected another name than 'planner' and 'expert', with "
                 f"settings from {', '.join(SAMPLING_SETTINGS)}."
             )
-        replace(own, **settings)
+        in_way(own, settings)
         check_scored(settings, value == "iql")
     return given
+
+
+def in_way(own: PlannerConfig, settings: dict[str, Any]) -> PlannerConfig:
+    """Return a planner's settings in a way to decide; who decides, and where, gives way to what that says of the other.
+
+    :raises ValueError: for values outside their range, or that this planner cannot have
+    """
+    try:
+        return replace(own, **settings)
+    except ValueError:  # such as of the actor, where the agent inpaints the present now
+        return replace(own, **{"decided_by": "plan", "present": PlannerConfig.present, **settings})
 
 
 def check_scored(settings: dict[str, Any], is_by_state: bool) -> None:
@@ -99,7 +110,7 @@ def play_trial(
     :raises KeyboardInterrupt: when ``should_stop`` has ended the trial
     """
     seed, own = int(np.random.randint(2**31)), model.policy.planner.config
-    ways = {name: replace(own, **settings) for name, settings in model.planner_ways.items()}
+    ways = {name: in_way(own, settings) for name, settings in model.planner_ways.items()}
     can_act = model._n_updates > 0 and 0 in (model.trained_ages or [])
     can_act &= model.policy.max_delay > 0  # without delay the actor is the expert
     others = {name: way for name, way in ways.items() if way != own and (way.decided_by == "plan" or can_act)}
@@ -189,6 +200,8 @@ def let_the_best_answer(
 
     :return: mean returns, the expert's ages, and the number of steps played, for the log
     """
+    own = model.policy.planner.config
+    configs = {name: in_way(own, settings) for name, settings in model.planner_ways.items()}
     trial = play_trial(model, n_episodes, progress_bar, should_stop)
     expert = trial.returns["expert"]
     ways = [name for name in trial.returns if name != "expert"]
@@ -199,10 +212,12 @@ def let_the_best_answer(
     together = np.where((trial.ages <= cut) == is_below, expert, trial.returns[way])
     if not gains_more_than_its_error(together, trial.returns[alone]):
         best = trial.returns[max(ways, key=lambda name: trial.returns[name].mean())]
-        in_order = [name for name in (*model.planner_ways, "planner") if name in ways]
+        in_order = ["planner" if config == own else name for name, config in configs.items()]  # as it was played
+        in_order = [name for name in (*in_order, "planner") if name in ways]
         way = next(name for name in in_order if not gains_more_than_its_error(best, trial.returns[name]))
         cut, is_below = (np.inf if alone == "expert" else -1.0), True
-    model.set_planner(**model.planner_ways.get(way, {}))
+    chosen = configs.get(way, own)
+    model.set_planner(**{name: getattr(chosen, name) for name in SAMPLING_SETTINGS if chosen != own})
     if 0 <= cut < model.policy.max_delay:
         model.set_answer("both", **({"expert_up_to": int(cut)} if is_below else {"expert_from": int(cut) + 1}))
     else:

@@ -6,6 +6,7 @@ import json
 import os
 import pathlib
 import signal
+import stat
 import subprocess
 import sys
 
@@ -130,3 +131,12 @@ def test_a_symbolic_link_keeps_pointing(tmp_path):
     assert (tmp_path / "link").is_symlink() and (tmp_path / "real").read_text() == "2"
     with pytest.raises(ValueError, match="folder"):
         write_text(tmp_path, "1")
+
+
+def test_who_may_read_a_file_stays(tmp_path):
+    target = tmp_path / "agent.zip"
+    target.write_bytes(b"old")
+    target.chmod(0o600)
+    with replacing(target) as file:
+        file.write(b"new")
+    assert target.read_bytes() == b"new" and stat.S_IMODE(target.stat().st_mode) == 0o600

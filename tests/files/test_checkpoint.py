@@ -132,6 +132,23 @@ def test_a_checkpoint_holds_the_whole_run(tmp_path):
     assert (python, numpy, torch) == (random.random(), np.random.rand(), th.rand(1))
 
 
+def test_a_machine_of_fewer_gpus_takes_the_random_states_of_as_many(monkeypatch):
+    taken, state = [], random_state()
+    monkeypatch.setattr(th.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(th.cuda, "device_count", lambda: 1)
+    monkeypatch.setattr(th.cuda, "set_rng_state_all", taken.extend)
+    restore_random_state({**state, "cuda": ["first", "second"]})
+    assert taken == ["first"]
+
+
+def test_a_run_that_was_stopped_at_once_has_no_checkpoint_before_it_is_written(tmp_path):
+    callback = TrainingCheckpointCallback(tmp_path, should_stop=lambda: True)
+    with pytest.raises(KeyboardInterrupt):
+        make().learn(100, callback)
+    assert not callback.path.exists()
+    assert callback.save() and callback.path.exists()
+
+
 @pytest.mark.parametrize("name", ["observations", "actions", "rewards", "dones", "timeouts"])
 def test_any_number_of_a_replay_tells_it_from_another(name):
     model = make().learn(40)
@@ -230,7 +247,12 @@ def test_a_resume_after_a_callback_has_ended_training_joins_no_two_episodes(tmp_
 @pytest.mark.parametrize(("n_envs", "save_freq", "expected"), [(1, 30, [30, 60, 90, 100]), (3, 30, [30, 60, 90, 102])])
 def test_when_checkpoints_are_written(tmp_path, monkeypatch, n_envs, save_freq, expected):
     written = []
-    monkeypatch.setattr(checkpoint, "save_tree", lambda path, state: written.append((path, state["counters"])))
+
+    def save(path, state):
+        written.append((path, state["counters"]))
+        path.touch()
+
+    monkeypatch.setattr(checkpoint, "save_tree", save)
     model = make(make_vec_env(delayed, n_envs=n_envs)).learn(100, TrainingCheckpointCallback(tmp_path, save_freq))
     assert [counters["num_timesteps"] for _, counters in written] == expected
     assert {path for path, _ in written} == {tmp_path / CHECKPOINT_NAME}

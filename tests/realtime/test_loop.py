@@ -238,6 +238,36 @@ def test_a_model_is_asked_for_the_draws_that_the_loop_was_told(deterministic):
     assert set(noted) == {deterministic}
 
 
+@pytest.mark.parametrize("n", [0, 1, 2])
+def test_it_recovers_from_a_sensor_that_was_silent_for_long(n):
+    """While no action is sent, an answer is to begin with the one that is missing."""
+    loop = in_steps(Planning(TASK, 4), n, hold_steps=1, safe_steps=1, max_age=1)
+    heard = []
+    for t in range(40):
+        if t < 3 or t > 12:
+            loop.observe(ZEROS + t, n_executed=loop.n_sent)
+        try:
+            loop.act(t)
+            heard.append(True)
+        except NoAnswer:
+            heard.append(False)
+    assert not any(heard[9:12]) and all(heard[13 + n :])
+
+
+def test_it_recovers_beside_a_worker_too():
+    with ControlLoop(Planning(TASK, 4), 1, answer_steps=1, hold_steps=1, safe_steps=1, max_age=1) as loop:
+        loop.observe(ZEROS, n_executed=0)
+        assert loop.wait(60)
+        with pytest.raises(NoAnswer):
+            for t in range(20):
+                loop.act(t)
+        n_sent = loop.n_sent
+        loop.observe(ZEROS + 1, n_executed=n_sent)
+        assert loop.wait(60)
+        loop.act(20)
+        assert loop.n_sent == n_sent + 1 and loop.answer_steps == 1
+
+
 def test_an_answer_later_than_expected_is_spliced_by_what_was_consumed():
     model = Planning(TASK, 8)
     loop = in_steps(model, 2, answer_steps=1)

@@ -447,3 +447,25 @@ def test_a_file_of_a_second_training_answers_as_the_callback_saw_it(tmp_path):
     loaded = SAID.load(tmp_path / "best_model.zip", device="cpu")
     assert loaded.policy.who_answers == "expert" and model.policy.who_answers == "planner"
     np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], seen[0])
+
+
+@pytest.mark.parametrize("what", ["trial", "student"])
+def test_an_environment_that_a_callback_has_played_begins_new_episodes(what):
+    class Plays(BaseCallback):
+        has_played = False
+
+        def _on_rollout_start(self):
+            if self.num_timesteps == 50 and not self.has_played:
+                self.has_played = True
+                self.model.train_planner(3, trial_episodes=1)
+                if what == "student":
+                    self.model.distill(8, n_labels=20, own_steps=10, rounds=1, gradient_steps=4)
+
+        def _on_step(self):
+            return True
+
+    callback = Plays()
+    model = make().learn(100, callback)
+    assert callback.has_played and model.num_timesteps == 100
+    steps = model.replay_buffer.steps[:100, 0]
+    assert steps[50] == 0 and model.replay_buffer.size() == 100

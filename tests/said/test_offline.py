@@ -131,6 +131,32 @@ def test_a_log_that_cannot_be_read_leaves_a_trained_agent_as_it_was(tmp_path):
     assert np.isfinite(answer(model, obs)).all()
 
 
+@pytest.mark.parametrize("how", ["refused", "stopped"])
+def test_a_training_that_does_not_begin_leaves_a_trained_agent_as_it_was(how, tmp_path):
+    model, obs = make(planner_kwargs={"temperature": 1.0}).learn(60), observe()
+    replay, before, own = model.replay_buffer, weights(model), answer(model, obs)
+    if how == "refused":
+        learn(steps=4, folder=tmp_path, save_interval=2)
+        with pytest.raises(SavedFileError, match="other data"):
+            model.learn_offline(log(seed=1), 4, folder=tmp_path)
+    else:
+        with pytest.raises(KeyboardInterrupt):
+            model.learn_offline(log(), 4, should_stop=lambda: True)
+    assert (model.value, model.planner_newest_fraction, model.policy.values) == ("critics", 1.0, None)
+    assert model.replay_buffer is replay and model.num_timesteps == 60
+    th.testing.assert_close(weights(model), before, rtol=0, atol=0)
+    np.testing.assert_array_equal(answer(model, obs), own)
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_after_logs_it_learns_online_from_steps_of_its_own(n_envs):
+    model = learn(make(DummyVecEnv([delayed] * n_envs)))
+    with pytest.warns(UserWarning, match="its replay no longer holds the dataset"):
+        model.learn(60)
+    assert model.replay_buffer.size() * n_envs == 60 and model.replay_buffer.buffer_size == 500 // n_envs
+    assert model.learn(20, reset_num_timesteps=False).replay_buffer.size() * n_envs == 80
+
+
 def test_other_logs_are_not_gone_on_with(tmp_path):
     learn(steps=4, folder=tmp_path, save_interval=2)
     with pytest.raises(SavedFileError, match="other data; give the same logs, or another folder"):

@@ -341,6 +341,15 @@ def test_training_the_planner_of_a_loaded_agent(trained, saved, tmp_path):
     assert not np.array_equal(answer(loaded, observe()), before)
 
 
+@pytest.mark.parametrize("name", ["gamma", "planner_terminal_penalty"])
+def test_a_checkpoint_is_not_gone_on_with_where_windows_weigh_otherwise(name, tmp_path):
+    model = make().learn(60)
+    model.train_planner(4, tmp_path)
+    setattr(model, name, 0.5)
+    with pytest.raises(ValueError, match=f"{name} was .* and is now 0.5"):
+        model.train_planner(4, tmp_path)
+
+
 def test_counts_of_later_trainings_may_be_written_as_floats_too():
     model = make().learn(60)
     model.train_planner(3.0)

@@ -183,6 +183,17 @@ def test_a_file_keeps_it_and_who_answers(taught, tmp_path):
     assert again.distill(**{**QUICK, "n_labels": 100, "gradient_steps": 50}) < 1  # by the planner's own visits
 
 
+def test_a_student_taught_again_goes_on_answering(pupil):
+    pupil.set_answer("student")
+    try:
+        pupil.distill(**{**QUICK, "own_steps": 0, "gradient_steps": 5})
+        assert pupil.policy.who_answers == "student"
+    finally:
+        pupil.set_answer("planner")
+    pupil.distill(**{**QUICK, "own_steps": 0, "gradient_steps": 5})
+    assert pupil.policy.who_answers == "planner"
+
+
 def test_it_learns_where_it_goes_itself(pupil, monkeypatch):
     visits, visited = [], student_module._visited
 

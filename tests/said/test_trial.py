@@ -184,6 +184,34 @@ def test_the_best_share_is_that_of_all(rows):
     assert np.isinf(cut) == (expert.mean() > best_alone + 1e-12)
 
 
+@pytest.mark.parametrize("settings", [{"present": "inpainted"}, {"decided_by": "actor"}, {"temperature": 0.0}])
+def test_a_decision_of_one_s_own_is_kept_in_a_file_and_tried_against_all_ways(settings, tmp_path):
+    """Some ways say otherwise of who decides, and where."""
+    ways = {**trial.WAYS, "inpainted": {"present": "inpainted"}}
+    model = make(env=pendulum(delay=(0, 2)), planner_ways=ways).learn(60)
+    model.set_planner(**settings)
+    model.save(tmp_path / "agent.zip")
+    loaded = SAID.load(tmp_path / "agent.zip", env=pendulum(delay=(0, 2)), device="cpu")
+    assert loaded.policy.planner.config == model.policy.planner.config and loaded.planner_ways == ways
+    model.train_planner(trial_episodes=1)
+    assert set(trial.play_trial(model, 1).returns) >= {"planner", "expert"}
+
+
+def test_ties_are_broken_in_the_same_order_again_and_again():
+    """Drift pays everyone alike. A way that the agent decides in already stands where it stood."""
+    model = make(planner_trial_episodes=2, planner_ways=trial.WAYS).learn(60)
+    for _ in range(2):
+        config = model.policy.planner.config
+        assert (config.temperature, config.sampling_steps, config.choice_factor) == (1.0, 2, 1.0)  # "weighed"
+        model.train_planner()
+    model.planner_ways = {"own": {"temperature": 1.0}, "other": {"temperature": 0.0}}
+    model.train_planner()
+    assert model.policy.planner.config.temperature == 1.0
+    model.planner_ways = {"other": {"temperature": 0.0}, "own": {"temperature": 1.0}}
+    model.train_planner()
+    assert model.policy.planner.config.temperature == 0.0
+
+
 def test_both_answer_only_where_that_gains_more_than_its_error():
     """The paired differences' mean has to exceed their standard error."""
     base = np.array([10.0, -7.0, 3.0, 3.0])
