@@ -5,7 +5,8 @@
 
 Each file is of sb3-said over-delays. Agents of one task, told apart by their file's SHA-256, are training seeds.
 
-SAID       both, each at its ages, where an agent's file shares them between planner and expert; else the planner
+SAID       both, each at its ages, where an agent's file shares them between planner and expert; else the planner, or
+           the expert of files after --expert-answers, whose trial found it better
 intervals  95 %, by a bootstrap that draws training seeds, then episodes of each; of one seed over its episodes
 seeds      their own means over fixed delays, in the order of the files
 falls      part of all episodes that the task ended
@@ -37,15 +38,16 @@ SAID, EXPERT = "SAID", "its expert"
 Seeds = list[dict[int | str, Cell]]  # for each training seed its cell by delay
 
 
-def read(paths: Iterable[Path]) -> dict[str, dict[str, Seeds]]:
+def read(paths: Iterable[Path], by_expert: Iterable[Path] = ()) -> dict[str, dict[str, Seeds]]:
     """Return by task and row what each training seed played.
 
+    :param by_expert: files of agents that answer by their expert
     :raises ValueError: for files of other episodes, an agent in two files, or one that has no row of SAID
     """
     found: dict[str, dict[str, Seeds]] = {}
     episodes: dict[str, dict[str, object]] = {}
     files: dict[str, Path] = {}
-    for path in paths:
+    for path in [*paths, *by_expert]:
         results = Results(path)
         env = str(results.settings["env"])
         if episodes.setdefault(env, results.settings) != results.settings:
@@ -57,6 +59,7 @@ def read(paths: Iterable[Path]) -> dict[str, dict[str, Seeds]]:
             files[agent] = path
             of_agent = [cell for cell in cells if cell.sha256 == agent]
             own = "both" if any(cell.answer == "both" for cell in of_agent) else "planner"
+            own = "expert" if path in by_expert else own
             for row, answer in ((SAID, own), (EXPERT, "expert")):
                 by_delay = {cell.delay: cell for cell in of_agent if cell.answer == answer}
                 if not by_delay:
@@ -129,10 +132,12 @@ def main(argv: list[str] | None = None) -> dict[str, dict[str, Seeds]]:
     """Print the table, draw the plot, and return what was read."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("files", nargs="+", type=Path, metavar="JSON")
+    p.add_argument("--expert-answers", nargs="+", type=Path, default=[], metavar="JSON", help="files of agents that "
+                   "answer by their expert")  # fmt: skip
     p.add_argument("--plot", type=Path, metavar="PNG", help="draw return over fixed delays, a panel for each task")
     args = p.parse_args(argv)
     try:
-        found = read(args.files)
+        found = read(args.files, args.expert_answers)
     except ValueError as error:
         p.error(str(error))
     show(found)

@@ -54,6 +54,14 @@ def test_rows_are_worked_out_by_hand(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert (tmp_path / "agents.png").read_bytes()[:4] == b"\x89PNG"
 
 
+def test_an_agent_that_its_trial_lets_the_expert_answer_is_its_expert(tmp_path: Path) -> None:
+    ours = write(tmp_path / "a.json", seed("a", "planner", 1000.0))
+    theirs = write(tmp_path / "b.json", seed("b", "planner", 3000.0))
+    found = online_table.main([ours, "--expert-answers", theirs])["Hopper-v5"]
+    means = {row: online_table.returns_over(seeds, [0]).mean(1).tolist() for row, seeds in found.items()}
+    assert means == {"SAID": [1000.0, 2900.0], "its expert": [900.0, 2900.0]}
+
+
 def test_a_seed_that_has_not_played_a_delay_counts_in_no_mean_over_it(tmp_path: Path) -> None:
     lacking = [one for one in seed("b", "planner", 3000.0) if one["delay"] != "WIFI_20MS"]
     rows = online_table.read([Path(write(tmp_path / "all.json", [*seed("a", "planner", 1000.0), *lacking]))])
