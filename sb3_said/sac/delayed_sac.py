@@ -8,7 +8,7 @@ import pathlib
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
@@ -32,8 +32,6 @@ from sb3_said.files.agents import SafeSaveMixin, existing
 from sb3_said.files.archive import load_tree, readable, save_tree
 from sb3_said.replay.buffer import DelayedReplayBuffer
 from sb3_said.sac.policies import DelayedSACPolicy, as_array
-
-SelfDelayedSAC = TypeVar("SelfDelayedSAC", bound="DelayedSAC")
 
 
 class DelayedSAC(SafeSaveMixin, SAC):
@@ -160,27 +158,19 @@ class DelayedSAC(SafeSaveMixin, SAC):
         """Return what the policy's constructor needs of this algorithm's own arguments."""
         return {"augment_state": self.augment_state, "delay_reconciled_critic": self.delay_reconciled_critic}
 
-    def learn(
-        self: SelfDelayedSAC,
+    def _setup_learn(
+        self,
         total_timesteps: int,
         callback: MaybeCallback = None,
-        log_interval: int | None = 4,
-        tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
+        tb_log_name: str = "SAC",
         progress_bar: bool = False,
-    ) -> SelfDelayedSAC:
-        """Learn as SB3 does.
-
-        :param tb_log_name: name of the run in TensorBoard, the class's by default
-        """
-        name = tb_log_name or type(self).__name__
-        return super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)  # type: ignore[arg-type]  # SB3 takes None
-
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+    ) -> tuple[int, BaseCallback]:
         obs = self._last_obs if self._vec_normalize_env is None else self._last_original_obs
         if obs is not None and not self.replay_buffer.knows_past(obs).all():  # emptied, or not loaded with the agent
             self._last_obs = None  # SB3 then resets the environments
-        learn = super()._setup_learn(*args, **kwargs)
+        name = type(self).__name__ if tb_log_name == "SAC" else tb_log_name  # SB3's default would be all algorithms'
+        learn = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, name, progress_bar)
         self.trained_ages = ages_of(self.env)
         return learn
 

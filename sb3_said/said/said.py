@@ -161,7 +161,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         total_timesteps: int,
         callback: MaybeCallback = None,
         log_interval: int | None = 4,
-        tb_log_name: str | None = None,
+        tb_log_name: str = "SAID",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfSAID:
