@@ -173,7 +173,7 @@ def best_share(planner: np.ndarray, expert: np.ndarray, ages: np.ndarray) -> tup
     """
     played = np.unique(ages)
     between = np.floor((played[:-1] + played[1:]) / 2)
-    cuts = [(cut, True) for cut in (-1.0, *between, np.inf)] + [(cut, False) for cut in between]
+    cuts = [(-1.0, True), *((cut, below) for below in (True, False) for cut in between), (np.inf, True)]
     means = [float(np.where((ages <= cut) == is_below, expert, planner).mean()) for cut, is_below in cuts]
     best = int(np.argmax(means))
     return means[best], *cuts[best]

@@ -12,6 +12,7 @@ import torch as th
 from gymnasium import spaces
 from kill import Kill, Killed
 from sb3_contrib.common.wrappers import TimeFeatureWrapper
+from small_agent import make as make_agent
 from small_task import Drift, LateDelay, OwnDelay, Simulator, delayed
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
@@ -527,7 +528,7 @@ def test_other_policies_are_refused_with_those_there_are(policy, message):
 @pytest.mark.parametrize("cls", [DelayedSAC, SAID])
 def test_runs_in_tensorboard_have_the_algorithm_s_name(cls, tmp_path):
     pytest.importorskip("tensorboard")
-    make(cls=cls, tensorboard_log=str(tmp_path)).learn(4)
+    make_agent(cls=cls, tensorboard_log=str(tmp_path)).learn(4)
     assert [path.name for path in tmp_path.iterdir()] == [f"{cls.__name__}_1"]
 
 

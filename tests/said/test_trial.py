@@ -6,7 +6,7 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from small_agent import answer, make, observe
 from small_task import delayed
@@ -170,6 +170,7 @@ def test_a_trial_can_be_stopped_and_the_planner_stays_trained(monkeypatch):
 
 
 @given(st.lists(st.tuples(*[st.integers(-50, 50)] * 2, st.integers(0, 6)), min_size=1, max_size=8))
+@example([(0, 0, 0), (0, 1, 1)])  # level at one age
 def test_the_best_share_is_that_of_all(rows):
     planner, expert, ages = np.array(rows, float).T
     mean, cut, is_below = trial.best_share(planner, expert, ages)
