@@ -21,7 +21,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import ConstantSchedule, get_device, get_system_info
 
 from sb3_said.files.archive import PathOrFile, SavedFileError, load_metadata, load_tree, readable, save_tree
-from sb3_said.files.arguments import as_data, check_noise, from_data, space_as_data, space_from_data
+from sb3_said.files.arguments import as_data, check_noise, from_data, space_as_data, space_from_data, with_given
 from sb3_said.files.checks import (
     check_argument,
     check_names,
@@ -153,10 +153,8 @@ class SafeSaveMixin(OffPolicyAlgorithm):
                 f"The given policy_kwargs {kwargs['policy_kwargs']} differ from {stored} in the file, which the saved"
                 " networks were built with. Leave them out of the call."
             )
-        for name in cls.settings_arguments:  # what is not given stays as the file has it
-            if isinstance(kwargs.get(name), dict):
-                kwargs[name] = {**(arguments.get(name) or {}), **kwargs[name]}
-        policy = (arguments := arguments | kwargs).pop("policy_class", cls.policy_aliases["MlpPolicy"])
+        arguments = with_given(arguments, kwargs, cls.settings_arguments)
+        policy = arguments.pop("policy_class", cls.policy_aliases["MlpPolicy"])
         with readable(path, explained=(ValueError, AssertionError)):  # SB3 asserts what it needs of an environment
             arguments |= {"device": device, "_init_setup_model": False}
             model = cls(policy, env, **arguments)  # type: ignore[arg-type]  # SB3 takes no env, too

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from numbers import Real
 from typing import Any
 
@@ -131,3 +131,15 @@ def space_from_data(node: Any) -> spaces.Space[Any]:
     if not fits or low.dtype.kind not in "iuf" or not np.all(low <= high):
         raise SavedFileError("a space has bounds that do not belong together")
     return spaces.Box(low, high, dtype=low.dtype)
+
+
+def with_given(settings: dict[str, Any], given: dict[str, Any], nested: Iterable[str]) -> dict[str, Any]:
+    """Return settings with those given in their place.
+
+    :param nested: names of settings that have names themselves, of which each can be given alone
+    """
+    for name in nested:
+        before, now = settings.get(name), given.get(name)
+        if isinstance(before, dict) and isinstance(now, dict):
+            given = {**given, name: {**before, **now}}
+    return {**settings, **given}

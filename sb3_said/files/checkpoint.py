@@ -78,8 +78,7 @@ class TrainingCheckpointCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._tried_at = self.model.num_timesteps
-        if self._saved_at != self._tried_at:
-            self._saved_at = self._tried_at if self.path.exists() else -1
+        self._saved_at = self._tried_at if self.path.exists() else -1
         self._clock.wait()
 
     def _on_rollout_start(self) -> None:

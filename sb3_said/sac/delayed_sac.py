@@ -311,11 +311,11 @@ class DelayedSAC(SafeSaveMixin, SAC):
         :raises SavedFileError: when the file is no replay, is damaged or forged, or was made with another task,
             ``buffer_size`` or ``n_envs``
         """
-        path = existing(path, ".pkl")  # type: ignore[arg-type,assignment]  # io.BufferedIOBase is IO
-        state = load_tree(path)  # type: ignore[arg-type]
+        found = existing(path, ".pkl")  # type: ignore[arg-type]  # io.BufferedIOBase is IO
+        state = load_tree(found)
         if self.replay_buffer is None:
             self.replay_buffer = self._new_replay_buffer()
-        with readable(path, explained=(ValueError,)):  # type: ignore[arg-type]
+        with readable(found, explained=(ValueError,)):
             self.replay_buffer.load_state_dict(state)
         self.replay_buffer.device = self.device
 

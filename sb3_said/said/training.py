@@ -55,8 +55,7 @@ class PlannerTraining:
         self._clock = None if folder is None else CheckpointClock(Path(folder) / PLANNER_CHECKPOINT_NAME)
         self.watcher = watcher
         self._data = {"num_timesteps": model.num_timesteps, "replay": checksum(model)}
-        self._weighed = {"gamma": model.gamma, "planner_terminal_penalty": model.planner_terminal_penalty}
-        self._weighed["value"] = model.value
+        self._weighed = {name: getattr(model, name) for name in ("gamma", "planner_terminal_penalty", "value")}
         self._value_losses: dict[str, th.Tensor] = {}  # of the last update; read at log times only
         if self._clock is not None and self._clock.path.exists():
             state = load_tree(self._clock.path)

@@ -81,6 +81,11 @@ def in_way(own: PlannerConfig, settings: dict[str, Any]) -> PlannerConfig:
         return replace(own, **{"decided_by": "plan", "present": PlannerConfig.present, **settings})
 
 
+def _configs(model: SAID) -> dict[str, PlannerConfig]:
+    """Return the planner's settings in each of the agent's ways to decide."""
+    return {name: in_way(model.policy.planner.config, settings) for name, settings in model.planner_ways.items()}
+
+
 def check_scored(settings: dict[str, Any], is_by_state: bool) -> None:
     """Refuse ways to score candidates in which V(s) would see no difference.
 
@@ -110,7 +115,7 @@ def play_trial(
     :raises KeyboardInterrupt: when ``should_stop`` has ended the trial
     """
     seed, own = int(np.random.randint(2**31)), model.policy.planner.config
-    ways = {name: in_way(own, settings) for name, settings in model.planner_ways.items()}
+    ways = _configs(model)
     can_act = model._n_updates > 0 and 0 in (model.trained_ages or [])
     can_act &= model.policy.max_delay > 0  # without delay the actor is the expert
     others = {name: way for name, way in ways.items() if way != own and (way.decided_by == "plan" or can_act)}
@@ -200,8 +205,7 @@ def let_the_best_answer(
 
     :return: mean returns, the expert's ages, and the number of steps played, for the log
     """
-    own = model.policy.planner.config
-    configs = {name: in_way(own, settings) for name, settings in model.planner_ways.items()}
+    own, configs = model.policy.planner.config, _configs(model)
     trial = play_trial(model, n_episodes, progress_bar, should_stop)
     expert = trial.returns["expert"]
     ways = [name for name in trial.returns if name != "expert"]
@@ -216,8 +220,7 @@ def let_the_best_answer(
         in_order = [name for name in (*in_order, "planner") if name in ways]
         way = next(name for name in in_order if not gains_more_than_its_error(best, trial.returns[name]))
         cut, is_below = (np.inf if alone == "expert" else -1.0), True
-    chosen = configs.get(way, own)
-    model.set_planner(**{name: getattr(chosen, name) for name in SAMPLING_SETTINGS if chosen != own})
+    model.policy.planner.config = configs.get(way, own)
     if 0 <= cut < model.policy.max_delay:
         model.set_answer("both", **({"expert_up_to": int(cut)} if is_below else {"expert_from": int(cut) + 1}))
     else:

@@ -24,6 +24,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_said import SAID, DelayedSAC, PlannerTrainingCallback, StableSAC
 from sb3_said.files.archive import SavedFileError
+from sb3_said.files.arguments import with_given
 from sb3_said.files.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback, restore_training
 from sb3_said.files.normalization import load_normalization, normalization_file, save_normalization
 from sb3_said.offline import BC, DQL, OfflineAlgorithm
@@ -61,17 +62,8 @@ for _name, (_class, _) in ALGORITHMS.items():
     HYPERPARAMS_CONVERTER[_name] = HYPERPARAMS_CONVERTER["sac"]
 
 
-#: Hyper-parameters that are settings themselves, of which each can be given alone.
-NESTED = ("planner_kwargs", "iql_kwargs", "diffusion_kwargs")
-
-
-def with_given(settings: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
-    """Return settings with those given in their place; of ``NESTED`` ones, each by itself."""
-    for name in NESTED:
-        before, now = settings.get(name), given.get(name)
-        if isinstance(before, dict) and isinstance(now, dict):
-            given = {**given, name: {**before, **now}}
-    return {**settings, **given}
+#: Hyper-parameters that are settings by name, of which each can be given alone.
+NESTED = sorted({name for cls, _ in ALGORITHMS.values() for name in cls.settings_arguments})
 
 
 @dataclass(frozen=True)
@@ -141,7 +133,7 @@ class DelayedExperimentManager(ExperimentManager):
             self._set_folder(run.resume)
             run.record.require(*(set(run.record.missing) - {*given}))
             run.record.check_hyperparams()
-            self.custom_hyperparams = with_given(run.record.hyperparams, given)
+            self.custom_hyperparams = with_given(run.record.hyperparams, given, NESTED)
             self.env_kwargs = {**run.record.env_kwargs, **self.env_kwargs}
             self.eval_env_kwargs = {**run.record.eval_env_kwargs, **self.eval_env_kwargs}
         else:
@@ -150,7 +142,7 @@ class DelayedExperimentManager(ExperimentManager):
                 run.expert_delay is not None
             ):  # whose environment would tell who is better there, and not under the other
                 overrides["planner_trial_episodes"] = 0
-            self.custom_hyperparams = with_given({**overrides, **ALGORITHMS[algo][1]}, given)
+            self.custom_hyperparams = with_given({**overrides, **ALGORITHMS[algo][1]}, given, NESTED)
 
     def release(self) -> None:
         """Let other processes train in the run's folder."""
@@ -166,7 +158,8 @@ class DelayedExperimentManager(ExperimentManager):
             given, self.custom_hyperparams = self.custom_hyperparams or {}, None
             with redirect_stdout(StringIO()):
                 of_file, _ = super().read_hyperparameters()
-            self.custom_hyperparams = with_given({name: of_file[name] for name in NESTED if name in of_file}, given)
+            of_file = {name: of_file[name] for name in NESTED if name in of_file}
+            self.custom_hyperparams = with_given(of_file, given, NESTED)
         hyperparams, saved = super().read_hyperparameters()
         if self.run.record is not None:  # the run has all of its own, and none of what its YAML holds today
             for settings in (hyperparams, saved):

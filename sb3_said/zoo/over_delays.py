@@ -252,14 +252,14 @@ def obstacle(run: LoadedRun, answer: str | None, delay: int | str) -> str | None
     :param run: whose action delay, if its task has one, comes on top
     :param answer: who acts in a SAID agent
     """
-    longest, model = longest_delay(run.model) or 0, run.model
+    longest, policy = longest_delay(run.model) or 0, run.model.policy
     low, high = (sum(ends) for ends in zip(age_range(delay), age_range(run.action_delay), strict=True))
     if high > longest:
         added = f", and its task delays actions by {run.action_delay}" if run.action_delay else ""
         return f"it was built for delays 0..{longest}{added}"
     if answer not in (None, "expert"):
         try:
-            model.policy.planner.check_ages(list(range(low, high + 1)))  # type: ignore[union-attr,operator]
+            policy.planner.check_ages(list(range(low, high + 1)))  # type: ignore[union-attr,operator]  # of SAID
         except ValueError as error:
             return str(error).removesuffix(".")
     return None

@@ -104,7 +104,10 @@ def test_ages_count_the_actions_on_their_way_as_play_does():
 
 @pytest.mark.parametrize("vec_env", [DummyVecEnv, SubprocVecEnv])
 def test_the_ages_of_logs_are_no_matter_of_an_episode_that_is_played(vec_env):
-    env = vec_env([lambda: DelayedObservationWrapper(Drift(), UniformDelay(0, 2), UniformDelay(0, 1))])
+    def make_env():
+        return DelayedObservationWrapper(Drift(), UniformDelay(0, 2), UniformDelay(0, 1))
+
+    env = vec_env([make_env])
     try:
         model = make(env)
         env.seed(3)
@@ -112,7 +115,7 @@ def test_the_ages_of_logs_are_no_matter_of_an_episode_that_is_played(vec_env):
         env.seed(3)
         env.reset()
         model.learn_offline(demonstrations(2), 1)  # amid the episode
-        twin = DummyVecEnv([lambda: DelayedObservationWrapper(Drift(), UniformDelay(0, 2), UniformDelay(0, 1))])
+        twin = DummyVecEnv([make_env])
         twin.seed(3)
         np.testing.assert_array_equal(twin.reset()["observation"], shown["observation"])
         for _ in range(9):

@@ -5,6 +5,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -86,10 +87,12 @@ def test_the_command_has_the_budget_wherever_it_was_given() -> None:
 
 def test_an_agent_of_logs_has_met_all_ages_of_its_delay(run: Path) -> None:
     played = load_run(run, device="cpu")
+    model: Any = played.model
     record = Record("said", ENV, 3, [1, 2], dataset=["a.npz"])
     assert card.ages_trained_on(played, record) == [0, 1, 2]
-    assert card.ages_trained_on(played, replace(record, dataset=[])) == played.model.trained_ages  # type: ignore[attr-defined]
-    facts = card.describe(played, record, SimpleNamespace(settings={"n_episodes": 1, "seed": 0}), [], [], None, 0)  # type: ignore[arg-type]
+    assert card.ages_trained_on(played, replace(record, dataset=[])) == model.trained_ages
+    results: Any = SimpleNamespace(settings={"n_episodes": 1, "seed": 0})
+    facts = card.describe(played, record, results, [], [], None, 0)
     assert "| gradient steps, on logs | 60 |" in facts
 
 

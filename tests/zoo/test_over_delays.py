@@ -234,7 +234,8 @@ def test_only_the_warning_of_another_delay_is_silent(sadr: Path) -> None:
 
 def test_a_planner_of_one_delay_plays_no_other(said: Path) -> None:
     run = load_run(said, device="cpu")
-    planner = run.model.policy.planner  # type: ignore[union-attr]  # it has one
+    policy: Any = run.model.policy
+    planner = policy.planner
     planner.config = replace(planner.config, mask="fixed", present="inpainted")
     found = {delay: over_delays.obstacle(run, "planner", delay) for delay in (1, 2, "UniformDelay(0, 2)")}
     assert found.pop(2) is None

@@ -15,8 +15,9 @@ pytest.importorskip("rl_zoo3")
 from stable_baselines3 import SAC
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC, PlannerConfig
+from sb3_said.files.arguments import with_given
 from sb3_said.zoo.arguments import Delay
-from sb3_said.zoo.manager import ALGORITHMS, DelayedExperimentManager, Run, with_given
+from sb3_said.zoo.manager import ALGORITHMS, NESTED, DelayedExperimentManager, Run
 from sb3_said.zoo.presets import PRESETS, config_file, preset_overrides
 
 TASKS = ("Ant-v5", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5")
@@ -130,7 +131,7 @@ def test_what_is_given_for_the_planner_leaves_the_rest_of_the_preset(tmp_path: P
     given = {"planner_kwargs": {"temperature": 0.7}, "gamma": 0.9}
     assert merged_settings("said", "cpu", "Hopper-v5", 4, tmp_path, given)["planner_kwargs"] == {"temperature": 0.7}
     before = {"planner_kwargs": {"depth": 2}, "iql_kwargs": {"expectile": 0.9}, "gamma": 0.99}  # as a resumed run's
-    assert with_given(before, given | {"iql_kwargs": {"updates": 1}}) == {
+    assert with_given(before, given | {"iql_kwargs": {"updates": 1}}, NESTED) == {
         "planner_kwargs": {"depth": 2, "temperature": 0.7},
         "iql_kwargs": {"expectile": 0.9, "updates": 1},
         "gamma": 0.9,
