@@ -92,6 +92,11 @@ def make_agent(setting: Setting, device: str) -> SAID:
     return model
 
 
+def with_first_guess(setting: Setting) -> Setting:
+    """Return the setting with the default's first guess, and its present too where the planner knows age 0."""
+    return setting._replace(config=replace(setting.config, first_guess="prior", present=None))
+
+
 def make_plain(setting: Setting, device: str, env: gym.Env[Any, Any]) -> Any:
     """Return the plain planner's decision, with SB3's critics: maps observations to actions."""
     obs_dim, act_dim = sizes(env)
@@ -152,7 +157,7 @@ def measure_setting(setting: Setting, rounds: int, device: str, rates: dict[str,
     obs = observe(env, setting.delay)
     plain = make_plain(setting, device, env)
     config = setting.config
-    guessing = make_agent(setting._replace(config=replace(config, first_guess="prior", present="guessed")), device)
+    guessing = make_agent(with_first_guess(setting), device)
     work = f"{config.sampling_steps} steps, {setting.n_candidates} candidate{'s' if setting.n_candidates > 1 else ''}"
     name = f"{setting.name}: depth {config.depth}, width {config.d_model}, {work}"
     size = setting.n_candidates * setting.length * config.d_model

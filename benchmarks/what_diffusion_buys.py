@@ -104,10 +104,10 @@ class Regression:
         return self.ask(state, action_history, delay)[0]
 
     def predict(self, observation: dict[str, np.ndarray], state: Any = None, **_: Any) -> tuple[np.ndarray, Any]:
-        tensors = {key: th.as_tensor(value) for key, value in observation.items()}
+        tensors = {key: th.as_tensor(value, device=self.model.device) for key, value in observation.items()}
         delay = tensors["delay"][:, 0].long()
         action = self.ask(tensors["observation"], tensors["action_history"], delay)[1]
-        return self.model.policy.unscale_action(action.numpy()), state
+        return self.model.policy.unscale_action(action.cpu().numpy()), state
 
 
 class Together:
@@ -128,7 +128,7 @@ class Together:
         return np.mean(answers, axis=0), state
 
 
-def open_run(folder: Path) -> SAID:
+def open_run(folder: Path, device: str = "cpu") -> SAID:
     """Return a run's agent with the replay of its checkpoint; of a run that has not ended, the checkpoint's agent.
 
     :raises ValueError: for a folder without a checkpoint or a saved SAID agent
@@ -137,7 +137,7 @@ def open_run(folder: Path) -> SAID:
     agents = [file for file in agents if not file.name.endswith(".normalize.zip")]
     if not agents or not (folder / CHECKPOINT_NAME).is_file():
         raise ValueError(f"{folder} has no {CHECKPOINT_NAME}, or no saved agent beside it; give a run of --algo said.")
-    run = load_agent(agents[0])
+    run = load_agent(agents[0], device)
     model = run.model
     if not isinstance(model, SAID):
         raise ValueError(f"{folder} is a run of {type(model).__name__}; give one of --algo said.")
@@ -149,12 +149,12 @@ def open_run(folder: Path) -> SAID:
     return model
 
 
-def open_with_log(agent: Path, log: Path) -> SAID:
+def open_with_log(agent: Path, log: Path, device: str = "cpu") -> SAID:
     """Return an agent whose replay is a log of its task.
 
     :raises ValueError: when it is no SAID agent, or the log not of its task
     """
-    run = load_agent(agent)
+    run = load_agent(agent, device)
     if not isinstance(run.model, SAID):
         raise ValueError(f"{agent} is a {type(run.model).__name__}; give a SAID agent.")
     run.model.set_env(run.make_env())
@@ -223,9 +223,9 @@ def players(model: SAID, rows: list[str], args: argparse.Namespace) -> Iterator[
             regression = Regression(trainer, model)
             with policy.answering("expert"):
                 yield "cloning", seed, regression
-                yield "regressed present", seed, BeliefOnly(regression, model)
+                yield "regressed present", seed, BeliefOnly(regression, model, model.device)
                 yield from (
-                    (f"{which} present", seed, BeliefOnly(PlannerBelief(policy.planner, which), model))
+                    (f"{which} present", seed, BeliefOnly(PlannerBelief(policy.planner, which), model, model.device))
                     for which in ("inpainted", "guessed")
                     if f"{which} present/{seed}" in rows  # not every planner has both
                 )
@@ -273,10 +273,12 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     p.add_argument("--n-envs", type=int, default=20)
     p.add_argument("--eval-seed", type=int, default=10_000, help="reset seed of the first episode")
     p.add_argument("--num-threads", type=int, default=1)
+    p.add_argument("--device", default="cpu", help="torch device, such as cuda")
     p.add_argument("--json", type=Path, required=True, help="file of the numbers, read and written")
     args = p.parse_args(argv)
     th.set_num_threads(args.num_threads)
-    model = open_run(args.run) if args.log is None else open_with_log(args.run, args.log)
+    opened = partial(open_run, args.run) if args.log is None else partial(open_with_log, args.run, args.log)
+    model = opened(device=args.device)
     preset = preset_of(model, args)
     if preset.first_guess == "none" and {"guessed present", GUESS_ALONE} & {*args.rows}:
         p.error(f"This planner has no first guess: leave 'guessed present' and {GUESS_ALONE!r} out of --rows.")

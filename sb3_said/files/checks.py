@@ -173,6 +173,7 @@ def check_optimizer_state(where: str, saved: dict[int, Any], optimizer: th.optim
     twin = copy.deepcopy(optimizer)
     twin.state.clear()
     for group in twin.param_groups:
+        group.setdefault("capturable", False)  # where there is a GPU, a copy of an Adafactor asks for it in vain
         for parameter in group["params"]:
             parameter.grad = th.zeros_like(parameter)
     twin.step()

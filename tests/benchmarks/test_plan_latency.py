@@ -63,6 +63,12 @@ def test_flops_grow_with_each_size():
     assert plan_latency.matmul_flops(changed(paper, scored_states="future"), OBS, ACT) < 203.8e9
 
 
+def test_every_setting_is_timed_with_a_first_guess_too():
+    guessing = [plan_latency.with_first_guess(setting).config for setting in plan_latency.SETTINGS]
+    assert {config.first_guess for config in guessing} == {"prior"}
+    assert [config.present for config in guessing] == ["inpainted"] * 2 + ["guessed"] * 3
+
+
 def test_line_through_points():
     line = plan_latency.fit_line([1, 2, 3, 4], [5.0, 7.0, 9.0, 11.0])
     assert line == pytest.approx({"intercept": 3.0, "slope": 2.0, "R2": 1.0})

@@ -8,6 +8,7 @@ import pickletools
 import resource
 import warnings
 import zipfile
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -193,6 +194,16 @@ def test_gradient_steps_after_loading_are_the_same(optimizer_class, tmp_path):
     assert same(model.get_parameters(), loaded.get_parameters())
     assert same(model.log_ent_coef.detach(), loaded.log_ent_coef.detach())
     assert not same(before, dict(loaded.policy.state_dict()))
+
+
+def test_an_adafactor_loads_on_a_machine_with_a_gpu(tmp_path, monkeypatch):
+    """A copied optimizer asks there whether its step can be recorded, and PyTorch's Adafactor does not know."""
+    model = make_sac(policy_kwargs={"net_arch": [8], "optimizer_class": th.optim.Adafactor}).learn(20)
+    model.save(tmp_path / "agent")
+    monkeypatch.setattr("torch.accelerator.current_accelerator", lambda check_available=False: th.device("cuda"))
+    monkeypatch.setattr("torch.accelerator.current_stream", lambda: SimpleNamespace(is_capturing=lambda: False))
+    loaded = DelayedSAC.load(tmp_path / "agent", device="cpu")
+    assert same(model.get_parameters(), loaded.get_parameters())
 
 
 def test_file_objects_and_any_name(trained, tmp_path):

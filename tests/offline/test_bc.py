@@ -61,10 +61,10 @@ def test_it_answers_with_the_action_of_the_hidden_present(learned):
     """The present follows from old state and history, so the error can vanish; acting on the old state keeps one."""
     held_out = demonstrations(seed=1)
     batch = held_out.to_replay(learned.observation_space, learned.action_space, learned._draw_ages()).sample(2_000)
-    obs = {key: batch.observations[key].numpy() for key in learned.observation_space.spaces}
+    obs = {key: batch.observations[key].cpu().numpy() for key in learned.observation_space.spaces}
     actions = learned.predict(obs, deterministic=True)[0] / 2.0  # Drift's bounds are -2 and 2
-    error = np.mean((actions - batch.actions.numpy()) ** 2)
-    ignoring = np.mean((np.tanh(-0.8 * obs["observation"][:, :1]) - batch.actions.numpy()) ** 2)
+    error = np.mean((actions - batch.actions.cpu().numpy()) ** 2)
+    ignoring = np.mean((np.tanh(-0.8 * obs["observation"][:, :1]) - batch.actions.cpu().numpy()) ** 2)
     assert error < 0.1 * ignoring and error < 0.01
 
 
@@ -182,7 +182,7 @@ def test_the_scale_is_the_datasets_and_is_saved(learned, tmp_path):
     np.testing.assert_allclose(normalizer.mean, data.states.mean(0), atol=1e-5)
     np.testing.assert_allclose(normalizer.deviation, data.states.std(0), atol=2e-4)
     learned.save(tmp_path / "bc.zip")
-    assert th.equal(BC.load(tmp_path / "bc.zip").policy.state_normalizer.mean, normalizer.mean)
+    assert th.equal(BC.load(tmp_path / "bc.zip", device="cpu").policy.state_normalizer.mean, normalizer.mean)
 
 
 def test_it_is_saved_and_loaded(learned, tmp_path):

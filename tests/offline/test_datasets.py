@@ -116,14 +116,14 @@ def test_a_replay_samples_what_followed_each_step(log, tmp_path):
     where = {x.tobytes(): i for i, x in enumerate(log["observations"])}
     batch = buffer.sample(200)
     starts = np.repeat([0, 5, 6], data.lengths)
-    for i, state in enumerate(batch.observations["undelayed_observation"].numpy()):
+    for i, state in enumerate(batch.observations["undelayed_observation"].cpu().numpy()):
         next_state, is_terminal = followed[state.tobytes()]
-        np.testing.assert_array_equal(batch.next_observations["undelayed_observation"][i], next_state)
+        np.testing.assert_array_equal(batch.next_observations["undelayed_observation"][i].cpu(), next_state)
         assert bool(batch.dones[i]) == is_terminal
         row = where[state.tobytes()]
         age = min(row - starts[row], 2)
         assert batch.observations["delay"][i] == age
-        np.testing.assert_array_equal(batch.observations["observation"][i], log["observations"][row - age])
+        np.testing.assert_array_equal(batch.observations["observation"][i].cpu(), log["observations"][row - age])
         assert batch.next_observations["delay"][i] == min(row - starts[row] + 1, 2)
 
 
@@ -132,7 +132,7 @@ def test_a_replay_samples_every_step_and_has_every_window(delay, log, tmp_path):
     """The first ones, too: nothing before them has been overwritten."""
     data = load(write(tmp_path / "log.npz", log))
     buffer = data.to_replay(delayed_space(STATES, ACTIONS, delay), ACTIONS)
-    sampled = {x.tobytes() for x in buffer.sample(500).observations["undelayed_observation"].numpy()}
+    sampled = {x.tobytes() for x in buffer.sample(500).observations["undelayed_observation"].cpu().numpy()}
     assert sampled == {x.tobytes() for x in data.states}
     source = buffer.window_source()
     assert source.start_states().numpy().tobytes() == data.states.tobytes()
