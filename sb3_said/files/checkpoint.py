@@ -51,7 +51,7 @@ class TrainingCheckpointCallback(BaseCallback):
     """Write everything that a run needs to go on, from time to time and when learning ends.
 
     Model, optimizers, replay buffer, counters, normalisation statistics, evaluations so far and random states go into
-    one file, which replaces the previous one only once it is whole.
+    one file, which replaces the previous one only once it is whole; with them how long SB3's monitor files were then.
 
     :param folder: of the run; the file is ``checkpoint.zip`` in it
     :param save_freq: environment steps between two checkpoints. By default time decides: ten minutes, and longer where
@@ -110,8 +110,9 @@ class TrainingCheckpointCallback(BaseCallback):
         if self._tried_at != self._saved_at:
             state = training_state(self.model, self.locals.get("callback"), self.keeps_replay)
             check_finite(state, self.path)
+            monitors = {file.name: file.stat().st_size for file in self.path.parent.glob("*.monitor.csv")}
             try:
-                save_tree(self.path, state)
+                save_tree(self.path, state, {"monitors": monitors})
                 self._saved_at = self._tried_at
             except OSError as error:
                 warnings.warn(

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+from sb3_said.files.archive import load_metadata
 from sb3_said.files.atomic import remove_abandoned
 from sb3_said.files.normalization import normalization_file
 from sb3_said.zoo.answer import BEST_NAME, EXPERT_FOLDER
@@ -52,22 +53,13 @@ def log_suffix(folder: Path, steps: int) -> str:
     return next(name for name in names if not (folder / f"progress{name}.csv").exists())
 
 
-def drop_undone_episodes(run_dir: Path, steps: int) -> None:
-    """Cut from SB3's monitor files the episodes that a resume undoes: those that ended after the checkpoint.
+def drop_undone_episodes(checkpoint: Path) -> None:
+    """Cut from SB3's monitor files beside a checkpoint the episodes that a resume undoes: those that ended after it.
 
     The episode during which the checkpoint was written is missing from the files.
-
-    :param steps: environment steps up to the checkpoint, of each environment
     """
-    for file in run_dir.glob("*.monitor.csv"):
-        lines = file.read_bytes().splitlines(keepends=True)
-        size, taken = len(b"".join(lines[:2])), 0  # a comment and the header: r,l,t
-        for line in lines[2:]:
-            taken += int(line.split(b",")[1]) if line.endswith(b"\n") else steps + 1  # unfinished: undone, too
-            if taken > steps:
-                break
-            size += len(line)
-        os.truncate(file, size)  # in place: the environments have opened it, to append to it
+    for name, size in load_metadata(checkpoint)["metadata"]["monitors"].items():
+        os.truncate(checkpoint.with_name(name), size)  # in place: the environments have opened it, to append to it
 
 
 def find_agent(path: Path) -> tuple[Path, Record | None]:

@@ -306,7 +306,7 @@ class DelayedExperimentManager(ExperimentManager):
                 callbacks = CallbackList(self.callbacks)
                 restore_training(model, self.checkpoint, callbacks)  # type: ignore[arg-type]  # one of ALGORITHMS
             print(f"Resuming {self.save_path} at step {model.num_timesteps}")
-            drop_undone_episodes(self.folder, model.num_timesteps // model.n_envs)
+            drop_undone_episodes(self.checkpoint)
         if self.run.record is not None:
             self._write_config()
         taken = model.num_timesteps if resumes else 0  # learn() counts the steps of an agent given with -i anew

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import itertools
+import json
 import multiprocessing
 import re
 import warnings
@@ -218,8 +219,9 @@ def at_any_age() -> Iterator[None]:
 
 
 def digest_of(run: LoadedRun) -> str:
-    """Return the SHA-256 of an agent's file."""
-    return hashlib.sha256(Path(run.info["file"]).read_bytes()).hexdigest()
+    """Return the SHA-256 of an agent's file, and of what its run changes in the task but its delay, if anything."""
+    changes = json.dumps(run.changes, sort_keys=True, default=repr).encode() if run.changes else b""
+    return hashlib.sha256(Path(run.info["file"]).read_bytes() + changes).hexdigest()
 
 
 def cells_of(label: str, row: list[LoadedRun], delays: list[int | str], only: str | None = None) -> Iterator[Cell]:
@@ -253,9 +255,10 @@ def obstacle(run: LoadedRun, answer: str | None, delay: int | str) -> str | None
     :param answer: who acts in a SAID agent
     """
     longest, policy = longest_delay(run.model) or 0, run.model.policy
-    low, high = (sum(ends) for ends in zip(age_range(delay), age_range(run.action_delay), strict=True))
+    action_delay = run.changes.get("action_delay", 0)
+    low, high = (sum(ends) for ends in zip(age_range(delay), age_range(action_delay), strict=True))
     if high > longest:
-        added = f", and its task delays actions by {run.action_delay}" if run.action_delay else ""
+        added = f", and its task delays actions by {action_delay}" if action_delay else ""
         return f"it was built for delays 0..{longest}{added}"
     if answer not in (None, "expert"):
         try:

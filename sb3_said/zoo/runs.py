@@ -8,7 +8,7 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from importlib.metadata import version
 from pathlib import Path
@@ -35,6 +35,7 @@ from sb3_said.zoo.manager import ALGORITHMS
 from sb3_said.zoo.record import WRAPPER, Record, import_packages, make_wrapper
 
 ANSWERS = get_args(Answer)
+DELAYS = {"delay", "max_delay", "state_history"}  # of the wrapper: what an agent plays under, and what it reads of it
 
 
 @dataclass(frozen=True)
@@ -50,8 +51,9 @@ class LoadedRun:
     """of the run, for results"""
     info: dict[str, Any]
     """what was loaded, in JSON types: algo, env, delay, file, trained_steps"""
-    action_delay: Any = 0
-    """of its task's wrapper, which comes on top of any observation delay"""
+    changes: dict[str, Any] = field(default_factory=dict)
+    """what its run changes in the task but the observation delay: arguments of ours, and those of other wrappers and of
+    ``gymnasium.make`` by their names"""
 
     def play(self, n_episodes: int, seed: int, n_envs: int = 1, age_error: int = 0, **kwargs: Any) -> Rollout:
         """Play whole episodes, see :func:`~sb3_said.evaluation.rollout`.
@@ -139,9 +141,11 @@ def load_run(
     env.close()
     info = {"algo": algo, "env": env_id, "delay": delay_name(delay_process)}
     info |= {"file": str(file), "trained_steps": model.num_timesteps}
-    ours = next((kwargs for name, kwargs in _named(wrappers) if "DelayedObservationWrapper" in str(name)), {})
-    normalize = _load_normalize(file, record, make_env)
-    return LoadedRun(model, make_env, normalize, file.parent, info, ours.get("action_delay", 0))
+    changes: dict[str, Any] = {"env_kwargs": kwargs} if kwargs else {}
+    for name, given in _named(wrappers):
+        is_ours = "DelayedObservationWrapper" in str(name)
+        changes |= {x: given[x] for x in given.keys() - DELAYS} if is_ours else {str(name): given}
+    return LoadedRun(model, make_env, _load_normalize(file, record, make_env), file.parent, info, changes)
 
 
 def described(file: Path) -> tuple[str | None, str | None]:

@@ -14,7 +14,7 @@ import optuna
 from filelock import FileLock
 from optuna.samplers import GridSampler, TPESampler
 from optuna.storages import BaseStorage, JournalStorage, RDBStorage
-from optuna.storages.journal import JournalFileBackend
+from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 from optuna.study import MaxTrialsCallback
 from optuna.trial import FrozenTrial, Trial, TrialState
 
@@ -164,7 +164,8 @@ def open_study(folder: Path, storage: str, name: str, settings: dict[str, Any], 
             backend: BaseStorage = RDBStorage(storage, engine_kwargs=patience)
         else:
             Path(storage).parent.mkdir(parents=True, exist_ok=True)
-            backend = JournalStorage(JournalFileBackend(storage))
+            # The default lock is a symbolic link, which Windows lets few users make
+            backend = JournalStorage(JournalFileBackend(storage, JournalFileOpenLock(storage)))
         study = optuna.create_study(
             storage=backend, study_name=name, direction="maximize", load_if_exists=True, pruner=pruner
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import warnings
 from dataclasses import replace
@@ -212,6 +213,12 @@ def test_a_changed_agent_is_played_again(said: Path, tmp_path: Path, monkeypatch
     )
     assert by_cell(new)["b", 1] != by_cell(old)["b", 1]
     assert by_cell(new)["a expert", 0] == by_cell(old)["a expert", 0]
+
+
+def test_an_agent_of_a_plain_run_is_its_file(said: Path, tmp_path: Path) -> None:
+    (copy := tmp_path / "alone.zip").write_bytes((said / f"{ENV}.zip").read_bytes())
+    digests = {over_delays.digest_of(load_run(path, device="cpu")) for path in (said, copy)}
+    assert digests == {hashlib.sha256(copy.read_bytes()).hexdigest()}
 
 
 def test_workers_change_the_speed_only(said: Path, tmp_path: Path) -> None:

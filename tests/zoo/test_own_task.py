@@ -95,6 +95,10 @@ def test_an_action_delay_of_the_task_counts_among_what_it_can_play(
     shown = capsys.readouterr().out
     assert "2 of 3 cells to play" in shown
     assert "cannot play delay 3: it was built for delays 0..3, and its task delays actions by 1" in shown
+    agent = run / "Pendulum-v1.zip"
+    (copy := tmp_path / "alone.zip").write_bytes(agent.read_bytes())  # which does not know of the task's action delay
+    over_delays.main([str(copy), *few, "--algo", "sadr", "--delays", "2", "--json", str(tmp_path / "over.json")])
+    assert "1 of 1 cells to play" in capsys.readouterr().out
 
 
 def forget_mine(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -134,6 +134,17 @@ def test_tpe_tries_as_many_as_it_is_told(tmp_path: Path, storage: str) -> None:
     assert len(temperatures) > 2 and 0.0 <= min(temperatures) <= max(temperatures) <= 1.0
 
 
+def test_a_journal_needs_no_symbolic_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: Any, **__: Any) -> None:
+        raise OSError(1314, "A required privilege is not held by the client")  # Windows says so to most users
+
+    monkeypatch.setattr("os.symlink", refused)
+    assert cells(run(tmp_path, Agent(lambda temperature, **_: temperature), [0.0, 1.0], (5,), "")) == [
+        (0.0, 5),
+        (1.0, 5),
+    ]
+
+
 @pytest.mark.parametrize("storage", ["", "sqlite:///{}/study.db"])
 def test_workers_share_a_grid(storage: str, tmp_path: Path) -> None:
     agents = [Agent(lambda temperature, **_: temperature) for _ in range(3)]
