@@ -188,9 +188,13 @@ class DelayedSAC(SafeSaveMixin, SAC):
                 self._last_obs = None
 
     def _sample_action(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, np.ndarray]:
-        if self._last_obs is None:  # a callback has played the environment before this rollout, as a trial does
+        if self._last_obs is None:  # a callback has played the environment, as a trial does
             self._begin_episodes()
         return super()._sample_action(*args, **kwargs)
+
+    def _store_transition(self, *args: Any, **kwargs: Any) -> None:
+        if self._last_obs is not None:  # else a callback has played at this very step, whose observation is gone
+            super()._store_transition(*args, **kwargs)
 
     def _begin_episodes(self) -> None:
         """Reset the environments, as SB3 does where learning begins."""

@@ -32,7 +32,7 @@ from stable_baselines3.common.vec_env import (
 )
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
+from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC, StableSAC
 from sb3_said.delays import TotalDelay, UniformDelay
 from sb3_said.delays.space import UNDELAYED
 from sb3_said.files.archive import SavedFileError, save_tree
@@ -390,6 +390,24 @@ def test_learning_goes_on_where_the_replay_has_not_seen_the_episode(make_env, no
     assert loaded.num_timesteps == 50 and len(rows) == 30
     if make_env is not Drift:  # where nothing is delayed, force_reset=False is the caller's promise, as in SB3
         assert_replay_is_what_happened(loaded, rows)
+
+
+@pytest.mark.parametrize("make_env", [Drift, lambda: delayed(4)], ids=["plain", "4"])
+@pytest.mark.parametrize("cls", [DelayedSAC, StableSAC])
+def test_a_callback_may_play_the_environment_after_a_step(make_env, cls, monkeypatch):
+    class Play(BaseCallback):
+        def _on_step(self):
+            if self.n_calls % 15 == 0:
+                with self.model.borrowed_env() as env:
+                    env.reset()
+                    env.step(np.array([env.action_space.sample()]))
+            return True
+
+    model = make(make_env(), cls=cls)
+    rows = record(model, monkeypatch)
+    model.learn(70, callback=Play())
+    assert model.num_timesteps == 70 and len(rows) == 70 - 4  # whose observations are gone
+    assert_replay_is_what_happened(model, rows)
 
 
 def test_a_replay_emptied_during_training_is_refused_with_what_to_do():
