@@ -119,22 +119,25 @@ def load_run(
     import_packages([*(record.gym_packages if record is not None else ()), *gym_packages])
 
     model = ALGORITHMS[algo][0].load(file, device=device)
-    wrappers = record.wrappers if record is not None else []
-    if delay is not None or record is None:
-        wrappers = _with_delay(wrappers, delay, model)
-    wrap = make_wrapper(wrappers)
     kwargs = {**(record.env_kwargs if record is not None else {}), **(env_kwargs or {})}
 
-    def make_env() -> gym.Env[Any, Any]:
+    def make_task() -> gym.Env[Any, Any]:
         try:
-            env: gym.Env[Any, Any] = gym.make(env_id, **kwargs)
+            return gym.make(env_id, **kwargs)
         except TypeError as error:
             raise ValueError(f"{env_id} cannot be made with {kwargs}: {error}") from error
-        return env if wrap is None else wrap(env)
+
+    wrappers = record.wrappers if record is not None else []
+    if delay is not None or (record is None and _process_of(make_task()) is None):  # a task may be registered with one
+        wrappers = _with_delay(wrappers, delay, model)
+    wrap = make_wrapper(wrappers)
+
+    def make_env() -> gym.Env[Any, Any]:
+        return make_task() if wrap is None else wrap(make_task())
 
     env = make_env()
     _check_spaces(model, env, file)
-    delay_process = env.get_wrapper_attr("process") if env.has_wrapper_attr("process") else FixedDelay(0)
+    delay_process = _process_of(env) or FixedDelay(0)
     if isinstance(model, DelayedSAC):
         with answering(model, answer):
             model.check_ages(ages_of(env))
@@ -215,6 +218,11 @@ def origin(run: LoadedRun) -> dict[str, Any]:
         "torch_threads": th.get_num_threads(),
         "versions": {"python": platform.python_version(), "sb3_said": __version__, **{p: version(p) for p in packages}},
     }
+
+
+def _process_of(env: gym.Env[Any, Any]) -> DelayProcess | None:
+    """Return the delays of a task that has some."""
+    return env.get_wrapper_attr("process") if env.has_wrapper_attr("process") else None
 
 
 def _with_delay(wrappers: list[Any], delay: Delay, model: BaseAlgorithm) -> list[Any]:

@@ -85,6 +85,19 @@ def test_a_task_may_have_a_dot_in_its_name(tmp_path: Path) -> None:
         del gym.registry["Arm.Reach-v1"]
 
 
+def test_a_task_registered_with_its_delay_keeps_it(tmp_path: Path) -> None:
+    gym.register("Late-v0", lambda: DelayedObservationWrapper(gym.make("Pendulum-v1"), delay=1, max_delay=2))
+    try:
+        train_here(tmp_path, f"--algo sadr --env Late-v0 {QUICK}")
+        run = tmp_path / "sadr" / "Late-v0-seed3_1"
+        (copy := tmp_path / "alone.zip").write_bytes((run / "Late-v0.zip").read_bytes())
+        for path in (run, copy):
+            opened = load_run(path, "sadr", "Late-v0", device="cpu")
+            assert opened.info["delay"] == 1 and opened.play(1, seed=0).lengths.tolist() == [200]
+    finally:
+        del gym.registry["Late-v0"]
+
+
 def test_an_action_delay_of_the_task_counts_among_what_it_can_play(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
