@@ -59,8 +59,6 @@ def test_no_modules_import_each_other_in_a_circle():
 @pytest.mark.parametrize(
     ("statement", "without"),
     [
-        ("import sb3_said", {"torch", "stable_baselines3"}),
-        ("import sb3_said.delays", {"torch", "stable_baselines3"}),
         ("from sb3_said import DelayedObservationWrapper", {"torch", "stable_baselines3"}),
         ("import sb3_said.planner", {"stable_baselines3", "gymnasium"}),
         ("import sb3_said; sb3_said.evaluation.rollout", {"torch", "stable_baselines3", "matplotlib"}),

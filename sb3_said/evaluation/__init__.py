@@ -6,7 +6,6 @@ from sb3_said.evaluation.statistics import (
     Latency,
     Summary,
     confidence_interval,
-    iqm,
     stratified_interval,
     worst_tenth,
 )
@@ -18,7 +17,6 @@ __all__ = [
     "Summary",
     "collect_observations",
     "confidence_interval",
-    "iqm",
     "measure_latency",
     "rollout",
     "stratified_interval",

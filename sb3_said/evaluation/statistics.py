@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import DegenerateDataWarning, bootstrap, trim_mean
+from scipy.stats import DegenerateDataWarning, bootstrap
 from scipy.stats import t as t_distribution
 
 # With fewer units a bootstrap interval covers less than Student's t, of normal and of skewed values alike.
@@ -115,15 +115,6 @@ class Summary:
         return {key: _without_nan(value) for key, value in asdict(self).items()}
 
 
-def iqm(values: np.ndarray, axis: int = -1) -> np.ndarray:
-    """Interquartile mean: the mean of the values left after dropping a quarter at each end (rounded down).
-
-    :param values: at least one value along ``axis``
-    :param axis: to reduce
-    """
-    return np.asarray(trim_mean(values, 0.25, axis=axis))
-
-
 def worst_tenth(returns: npt.ArrayLike) -> float:
     """Return the mean of the lowest tenth of returns, rounded up to at least one.
 
@@ -154,7 +145,7 @@ def confidence_interval(
     - ``"percentile bootstrap"`` where BCa is undefined, because leaving out any one unit changes nothing.
 
     :param values: (n,), one for each unit; or (n_seeds, n_episodes), whose rows are the units
-    :param statistic: of (..., k) along ``axis=-1``, such as ``np.mean`` or ``iqm``; of all values of all units
+    :param statistic: of (..., k) along ``axis=-1``, such as ``np.mean``; of all values of all units
     :param confidence: probability that the interval is to cover, in (0, 1)
     :param n_resamples: bootstrap samples
     :param seed: of the resampling; fixed, so that the same episodes give the same interval

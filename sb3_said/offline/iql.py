@@ -15,6 +15,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_said.offline.datasets import Dataset
+from sb3_said.planner.checks import check_same
 
 
 class Transitions(NamedTuple):
@@ -176,11 +177,8 @@ class IQL:
 
         :raises ValueError: when that training had other settings, so that the end would be neither's
         """
-        if (saved := state["config"]) != (own := asdict(self.values.config)):
-            raise ValueError(
-                f"V(s) was learned with iql_kwargs {saved} and is to go on with {own}; give the old ones, or start a "
-                "new training."
-            )
+        advice = "Give the old iql_kwargs, or start a new training."
+        check_same("V(s) was learned", state["config"], asdict(self.values.config), advice)
         self.values.load_state_dict(state["values"])
         self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": state["optimizer"]})
         self.generator.set_state(state["generator"])

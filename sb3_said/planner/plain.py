@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch as th
 from torch import nn
 
+MODEL_WIDTH, MODEL_BLOCKS = 256, 4
 RIGHT = 1e-4  # squared error, in moves, below which an entry counts as known: a hundredth of its move
 
 
@@ -27,12 +28,6 @@ class ResidualBlock(nn.Module):
         return x + self.net(x)
 
 
-def residual_network(n_in: int, n_out: int, width: int, n_blocks: int) -> nn.Sequential:
-    """Return a network of residual blocks."""
-    blocks = [ResidualBlock(width) for _ in range(n_blocks)]
-    return nn.Sequential(nn.Linear(n_in, width), *blocks, nn.Linear(width, n_out))
-
-
 class OneStepModel(nn.Module):
     """Predicts the state that follows an action, as a difference from the one before, in units of its usual moves.
 
@@ -45,7 +40,8 @@ class OneStepModel(nn.Module):
 
     def __init__(self, obs_dim: int, act_dim: int) -> None:
         super().__init__()
-        self.net = residual_network(obs_dim + act_dim, obs_dim, 256, 4)
+        blocks = [ResidualBlock(MODEL_WIDTH) for _ in range(MODEL_BLOCKS)]
+        self.net = nn.Sequential(nn.Linear(obs_dim + act_dim, MODEL_WIDTH), *blocks, nn.Linear(MODEL_WIDTH, obs_dim))
         self.register_buffer("move_std", th.ones(obs_dim))
 
     def forward(self, state: th.Tensor, action: th.Tensor) -> th.Tensor:

@@ -2,9 +2,7 @@
 
 import copy
 import json
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -12,8 +10,6 @@ import pytest
 import torch as th
 
 pytest.importorskip("rl_zoo3")
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
 import what_diffusion_buys as script
 from small_run import ENV, TINY_PLANNER, write_run

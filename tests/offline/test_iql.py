@@ -116,7 +116,7 @@ def test_a_resumed_training_ends_as_one_that_never_stopped():
     for _ in range(3):
         second.step()
     th.testing.assert_close(second.values.state_dict(), whole.values.state_dict(), rtol=0, atol=0)
-    with pytest.raises(ValueError, match=r"'expectile': 0\.7, .* and is to go on with .*'expectile': 0\.9, "):
+    with pytest.raises(ValueError, match=r"V\(s\) was learned with .*: expectile was 0\.7 and is now 0\.9\. "):
         make(expectile=0.9).load_state_dict(saved)
 
 

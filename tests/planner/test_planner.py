@@ -1,6 +1,5 @@
 """The planner: loss, plans, selection, refusals."""
 
-import dataclasses
 import math
 
 import numpy as np
@@ -28,7 +27,6 @@ from torch.utils.flop_counter import FlopCounterMode
 from sb3_said.planner import InpaintingPlanner, precision
 from sb3_said.planner.diffusion import alpha_sigma, draw_times
 from sb3_said.planner.selection import choose
-from sb3_said.replay.windows import Windows
 
 # --- loss ------------------------------------------------------------------------------------------------------------
 
@@ -400,32 +398,6 @@ def test_plan_leaves_no_graph_and_works_with_frozen_weights():
     planner = make_planner().requires_grad_(False)
     assert not planner.plan(*make_batch(2)).states.requires_grad
     assert not make_planner().plan(*make_batch(2)).states.requires_grad
-
-
-def test_training_learns_to_decode_the_present():
-    """s' = s + a: after a short training the hidden present is the old state plus the known actions."""
-    th.manual_seed(0)
-    generator = seeded()
-    planner = InpaintingPlanner(1, 1, 2, dataclasses.replace(SMALL, horizon=2, sampling_steps=4))
-
-    def draw(n):
-        actions = th.rand(n, 4, 1, generator=generator) * 2 - 1
-        states = th.randn(n, 1, 1, generator=generator) + actions.cumsum(1) - actions
-        return Windows(states, actions, th.ones(n, 4, dtype=th.bool), th.ones(n))
-
-    data = draw(2000)
-    planner.fit_normalizer(data.states.flatten(0, 1), data.actions.flatten(0, 1))
-    optimizer = th.optim.Adam(planner.parameters(), lr=2e-3)
-    for _ in range(200):
-        optimizer.zero_grad()
-        planner.loss(draw(128), generator=generator).backward()
-        optimizer.step()
-    test = draw(300)
-    for d in (0, 1, 2):
-        history = th.cat([th.zeros(300, 2 - d, 1), test.actions[:, :d]], 1)
-        plan = planner.plan(test.states[:, 0], history, th.full((300,), d), temperature=0.0)
-        error = (plan.states[:, 0, d] - test.states[:, d]).abs().mean().item()
-        assert error <= 0.15 * test.states.std().item()
 
 
 # --- refusals --------------------------------------------------------------------------------------------------------

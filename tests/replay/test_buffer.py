@@ -404,7 +404,7 @@ def test_reset_forgets_everything():
 # ---------------------------------------------------------------------------------------------------- memory
 
 
-def memory_per_transition(delay, episode_length, n_steps=5000):
+def memory_per_transition(delay, episode_length, n_steps=1000):
     """Return bytes of all that is stored over the transitions it holds, for Ant-v5's dimensions."""
     state_space, act_space = spaces.Box(-np.inf, np.inf, (105,)), spaces.Box(-1, 1, (8,))
     buffer = DelayedReplayBuffer(n_steps, delayed_space(state_space, act_space, delay), act_space)

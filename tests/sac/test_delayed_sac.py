@@ -213,9 +213,6 @@ def test_ages_that_it_has_not_met_are_never_taken_silently(tmp_path):
         loaded = DelayedSAC.load(tmp_path / "agent", env=delayed(UniformDelay(0, 2)))
     loaded.learn(30)  # goes on under the new delays, and knows them from then on
     assert loaded.trained_ages == [0, 1, 2]
-    with pytest.raises(ValueError, match="built for max_delay=2, but this environment has max_delay=3"):
-        model.set_env(delayed(3))
-    assert model.env.get_attr("max_delay") == [2]  # what is refused is not taken
 
 
 @pytest.mark.parametrize("first", [0, 1])
@@ -281,10 +278,6 @@ def test_save_and_load(tmp_path):
     assert_same_parameters(model, loaded)
     loaded.set_env(delayed())
     assert loaded.learn(40, reset_num_timesteps=False).num_timesteps == 80
-    with pytest.raises(ValueError, match="built for max_delay=2, but this environment has max_delay=3"):
-        DelayedSAC.load(tmp_path / "agent", env=delayed(3))
-    with pytest.raises(ValueError, match="built for max_delay=2, but this environment has max_delay=3"):
-        model.set_env(delayed(3))
 
 
 def own():
@@ -639,7 +632,6 @@ def changed(**parts):
     return {**observe(), **parts}
 
 
-@pytest.mark.parametrize("deterministic", [True, False])
 @pytest.mark.parametrize(
     ("obs", "message"),
     [
@@ -668,7 +660,7 @@ def changed(**parts):
         ({**observe(), 3: np.zeros(2)}, "with the keys"),
     ],
 )
-def test_bad_observations_are_refused_before_anything_is_computed(obs, message, deterministic, monkeypatch):
+def test_bad_observations_are_refused_before_anything_is_computed(obs, message, monkeypatch):
     model = make()
 
     def computed(*_, **__):
@@ -677,7 +669,7 @@ def test_bad_observations_are_refused_before_anything_is_computed(obs, message, 
     monkeypatch.setattr(model.policy.actor, "forward", computed)
     state = th.get_rng_state()
     with pytest.raises(ValueError, match=message):
-        model.predict(obs, deterministic=deterministic)
+        model.predict(obs)
     assert th.equal(state, th.get_rng_state())
 
 

@@ -292,12 +292,6 @@ def test_a_training_that_diverges_leaves_the_planner_as_it_was(monkeypatch, is_t
     assert np.isfinite(model.predict(model.env.reset(), deterministic=True)[0]).all()
 
 
-def test_every_training_starts_anew():
-    """A second training ends as if there had been no first, on the replay as it then is."""
-    often, once = make(planner_train_freq=40).learn(100), make().learn(100)
-    assert_same(planner_of(often), planner_of(once))
-
-
 def test_cancelling_one_of_several_trainings_does_not_end_learning(monkeypatch, trainings):
     interrupt_at(monkeypatch, 2, KeyboardInterrupt)
     model = make(planner_train_freq=40).learn(100)

@@ -171,29 +171,6 @@ def test_other_answers_follow_the_global_seed(trained, who):
 
 
 @pytest.mark.parametrize("deterministic", [True, False])
-@pytest.mark.parametrize(
-    ("key", "value", "message"),
-    [
-        ("observation", [np.nan, 0.0], "observation has entries that are NaN"),
-        ("action_history", [[0.0], [np.nan]], "action_history has entries that are NaN"),
-        ("action_history", np.zeros((3, 1)), "another task or max_delay"),
-        ("observation", np.zeros(3), r"observation has the shape \(3,\)"),
-        ("delay", [3.0], "max_delay=2"),
-        ("delay", [-1.0], r"0\.\.2"),
-        ("delay", [0.5], "whole numbers"),
-    ],
-)
-def test_bad_observations_are_refused_before_planning(trained, key, value, message, deterministic, monkeypatch):
-    def computed(*_, **__):
-        raise AssertionError("the planner was asked")
-
-    monkeypatch.setattr(trained.policy.planner, "plan", computed)
-    obs = rows_of(observe())[3] | {key: np.asarray(value, np.float32)}
-    with pytest.raises(ValueError, match=message):
-        trained.predict(obs, deterministic=deterministic)
-
-
-@pytest.mark.parametrize("deterministic", [True, False])
 @pytest.mark.parametrize("temperature", [0.0, 0.5])
 @pytest.mark.parametrize("who", ["planner", "expert"])
 def test_what_no_network_can_answer_is_refused(saved, who, temperature, deterministic):

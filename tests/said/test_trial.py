@@ -314,8 +314,6 @@ def test_no_episodes_and_no_environment_leave_the_planner(trained, monkeypatch):
     model.planner_trial_episodes, model.env = 3, None
     model.train_planner()
     assert model.policy.who_answers == "planner"
-    with pytest.raises(ValueError, match="-1"):
-        make(planner_trial_episodes=-1)
 
 
 def test_the_trial_is_no_training(monkeypatch):
