@@ -246,7 +246,7 @@ def random_state() -> dict[str, Any]:
     """Return the global random states of Python, NumPy and torch."""
     name, keys, *numpy_rest = np.random.get_state(legacy=True)
     state = {"python": random.getstate(), "numpy": [name, np.asarray(keys), *numpy_rest], "torch": th.get_rng_state()}
-    if th.cuda.is_available():
+    if th.cuda.is_initialized():  # a run on the CPU takes no memory of a GPU
         state["cuda"] = th.cuda.get_rng_state_all()
     return state
 

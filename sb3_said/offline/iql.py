@@ -145,7 +145,7 @@ class IQL:
         device = values.mean.device
         rows = (data.states, data.actions, data.rewards, data.next_states, data.terminated.astype(np.float32))
         self.data = Transitions(*(th.from_numpy(np.ascontiguousarray(column)).to(device) for column in rows))
-        values.fit(self.data.states, th.from_numpy(data.returns).to(device), int(data.lengths.max()))
+        values.fit(self.data.states, th.from_numpy(data.returns), int(data.lengths.max()))
         trained = [*values.v.parameters(), *values.q.parameters()]
         self.optimizer = th.optim.Adam(trained, lr=values.config.learning_rate)
         self.generator = th.Generator().manual_seed(seed)
@@ -156,7 +156,8 @@ class IQL:
         :return: both losses
         """
         drawn = th.randint(len(self.data.rewards), (self.values.config.batch_size,), generator=self.generator)
-        losses = self.values.losses(Transitions(*(part[drawn.to(part.device)] for part in self.data)), self.gamma)
+        drawn = drawn.to(self.data.rewards.device)
+        losses = self.values.losses(Transitions(*(part[drawn] for part in self.data)), self.gamma)
         self.optimizer.zero_grad()
         (losses["v_loss"] + losses["q_loss"]).backward()
         self.optimizer.step()

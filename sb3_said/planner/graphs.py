@@ -2,31 +2,42 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
+from functools import cache
 
 import torch as th
 
 EAGER_CALLS = 3  # before recording, as torch.cuda.graph asks: libraries set themselves up, optimizers make their state
 
+#: A process records one graph at a time, and a recording has its inputs in one place, whatever thread asks.
+_LOCK = threading.RLock()
 
-class RecordedFunction:
-    """Run a function of tensors on a GPU: a few times as it is, then recorded once and replayed.
+
+@cache
+def _side_stream(device: th.device) -> th.cuda.Stream:
+    """Return the one stream on which functions are run before they are recorded, and recorded.
+
+    Not the default stream, which cannot be recorded and to which gradients would be tied; and one for all, as libraries
+    keep memory for each that they have seen. ``torch.cuda.graph`` would take one of the current GPU.
+    """
+    return th.cuda.Stream(device)
+
+
+class Recording:
+    """Runs one function of tensors on a GPU: a few times as it is, then recorded once and replayed.
 
     The function must do the same work on every call, on tensors that stay in their places, and never wait for the
-    device. A planner's update is about a thousand launches without this, a decision some hundreds.
+    device. A planner's update is about a thousand launches without this, a decision some hundreds. It is handed over at
+    each call and not kept: it often belongs to whoever has the recording, and such a circle would hold a GPU's memory
+    until Python looks for circles.
 
-    :param function: maps the inputs to a tuple of tensors
     :param device: the GPU
     :param generator: that the function draws from, if any; replays draw from it what the function itself would
     """
 
-    def __init__(
-        self,
-        function: Callable[..., tuple[th.Tensor, ...]],
-        device: th.device,
-        generator: th.Generator | None = None,
-    ) -> None:
-        self.function, self.device, self.generator = function, device, generator
+    def __init__(self, device: th.device, generator: th.Generator | None = None) -> None:
+        self.device, self.generator = device, generator
         self.forget()
 
     def forget(self) -> None:
@@ -34,29 +45,39 @@ class RecordedFunction:
         self.n_eager = 0
         self.graph: th.cuda.CUDAGraph | None = None
 
-    def __call__(self, *inputs: th.Tensor) -> tuple[th.Tensor, ...]:
-        """Return the function of inputs, which have the same shapes in all calls."""
-        if self.n_eager < EAGER_CALLS:
-            self.n_eager += 1
-            return self._eager(inputs)
-        if self.graph is None:
-            self.inputs = [x.clone() for x in inputs]
-            graph = th.cuda.CUDAGraph()
-            if self.generator is not None:
-                graph.register_generator_state(self.generator)
-            with th.cuda.graph(graph):  # recorded, not run
-                self.outputs = self.function(*self.inputs)
-            self.graph = graph
-        for static, x in zip(self.inputs, inputs, strict=True):
-            static.copy_(x)
-        self.graph.replay()
-        return tuple(output.clone() for output in self.outputs)
+    def __call__(self, function: Callable[..., tuple[th.Tensor, ...]], *inputs: th.Tensor) -> tuple[th.Tensor, ...]:
+        """Return the function of inputs, which have the same shapes in all calls.
 
-    def _eager(self, inputs: tuple[th.Tensor, ...]) -> tuple[th.Tensor, ...]:
-        # On a stream of its own, so that gradients are not tied to the default stream, which cannot be recorded
-        stream, current = th.cuda.Stream(self.device), th.cuda.current_stream(self.device)
+        :param function: the same in all calls; maps the inputs to a tuple of tensors
+        """
+        with _LOCK, th.cuda.device(self.device):
+            if self.n_eager < EAGER_CALLS:
+                self.n_eager += 1
+                return self._eager(function, inputs)
+            if self.graph is None:
+                self._record(function, inputs)
+            assert self.graph is not None
+            for static, x in zip(self.inputs, inputs, strict=True):
+                static.copy_(x)
+            self.graph.replay()
+            return tuple(output.clone() for output in self.outputs)
+
+    def _record(self, function: Callable[..., tuple[th.Tensor, ...]], inputs: tuple[th.Tensor, ...]) -> None:
+        self.inputs = [x.clone() for x in inputs]
+        graph = th.cuda.CUDAGraph()
+        if self.generator is not None:
+            graph.register_generator_state(self.generator)
+        # Recorded, not run. Another thread may go on with the GPU meanwhile
+        with th.cuda.graph(graph, stream=_side_stream(self.device), capture_error_mode="thread_local"):
+            self.outputs = function(*self.inputs)
+        self.graph = graph
+
+    def _eager(
+        self, function: Callable[..., tuple[th.Tensor, ...]], inputs: tuple[th.Tensor, ...]
+    ) -> tuple[th.Tensor, ...]:
+        stream, current = _side_stream(self.device), th.cuda.current_stream(self.device)
         stream.wait_stream(current)
         with th.cuda.stream(stream):
-            outputs = self.function(*inputs)
+            outputs = function(*inputs)
         current.wait_stream(stream)
         return outputs

@@ -14,7 +14,7 @@ from sb3_said.planner.checks import checked_delay, checked_extra_states, finite_
 from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.dit import DiT1d
 from sb3_said.planner.first_guess import FirstGuess
-from sb3_said.planner.graphs import RecordedFunction
+from sb3_said.planner.graphs import Recording
 from sb3_said.planner.normalizer import Normalizer
 from sb3_said.planner.precision import autocast
 from sb3_said.planner.prior import Prior
@@ -78,7 +78,7 @@ class InpaintingPlanner(nn.Module):
         self.normalizer = Normalizer(
             obs_dim, act_dim, self.window_length, config.action_transform, config.relative_states
         )
-        self._graphs: dict[Hashable, RecordedFunction] = {}
+        self._graphs: dict[Hashable, Recording] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_graphs": {}}  # a copy records its own
@@ -252,7 +252,9 @@ class InpaintingPlanner(nn.Module):
                 "PlannerConfig(extra_state_probability=0.5), or leave state_history and state_known out."
             )
         shortest, longest = int(delay.min()), int(delay.max())
-        length = longest + config.horizon  # a decision costs what its age costs
+        is_recorded = self._can_be_recorded(value_fn)
+        # A decision costs what its age costs; but on a GPU hardly less, and one graph serves all ages
+        length = self.window_length if is_recorded else longest + config.horizon
         temperature = config.temperature if temperature is None else temperature
         window = (length, self.obs_dim + self.act_dim)
         if noise is not None:
@@ -275,8 +277,11 @@ class InpaintingPlanner(nn.Module):
             x = temperature * noise.expand(n, n_candidates, *window)  # (B, N, L, obs_dim + act_dim)
         times = th.tensor([step.t for step in steps], device=device)
         inputs = (times, observation, action_history, delay, x, *extra_states)
-        if self._can_be_recorded(value_fn):
-            plan = Plan(*self._graph(steps, value_fn, x.shape)(*inputs))
+        if is_recorded:
+            function = partial(self._inpaint, steps, value_fn, 0, True)
+            plan = Plan(*self._graph(steps, value_fn, x.shape)(function, *inputs))
+            reached = longest + config.horizon
+            plan = plan._replace(states=plan.states[:, :, :reached], actions=plan.actions[:, :, :reached])
         else:
             plan = self._inpaint(steps, value_fn, shortest, longest > shortest, *inputs)
         if plan.values.isnan().any():
@@ -312,9 +317,7 @@ class InpaintingPlanner(nn.Module):
     def _can_be_recorded(self, value_fn: ValueFn | None) -> bool:
         return self.device.type == "cuda" and (value_fn is None or isinstance(_owner(value_fn), nn.Module))
 
-    def _graph(
-        self, steps: Sequence[diffusion.SolverStep], value_fn: ValueFn | None, shape: th.Size
-    ) -> RecordedFunction:
+    def _graph(self, steps: Sequence[diffusion.SolverStep], value_fn: ValueFn | None, shape: th.Size) -> Recording:
         """Return the graph of decisions with these settings and sizes, and with the weights where they now lie."""
         modules: list[Any] = [self] if value_fn is None else [self, _owner(value_fn)]
         tensors = [tensor for module in modules for tensor in (*module.parameters(), *module.buffers())]
@@ -322,7 +325,7 @@ class InpaintingPlanner(nn.Module):
         if key not in self._graphs:
             if len(self._graphs) == MAX_GRAPHS:
                 del self._graphs[next(iter(self._graphs))]  # the oldest
-            self._graphs[key] = RecordedFunction(partial(self._inpaint, steps, value_fn, 0, True), self.device)
+            self._graphs[key] = Recording(self.device)
         return self._graphs[key]
 
     def _inpaint(

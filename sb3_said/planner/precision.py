@@ -14,7 +14,8 @@ SMALL = 48 * 128
 def has_bfloat16(device: th.device) -> bool:
     """Tell whether a device multiplies bfloat16 matrices in hardware; emulation would be slower than float32."""
     if device.type == "cuda":
-        return th.cuda.is_bf16_supported(including_emulation=False)
+        with th.cuda.device(device):
+            return th.cuda.is_bf16_supported(including_emulation=False)
     if device.type == "cpu":
         capabilities = th.cpu.get_capabilities() if hasattr(th.cpu, "get_capabilities") else {}  # not in older PyTorch
         return any(capabilities.get(name, False) for name in ("avx512_bf16", "amx_bf16"))

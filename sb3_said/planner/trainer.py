@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from sb3_said.planner.checks import check_same
 from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.first_guess import GUESS_BATCH_SIZE, fit_first_guess
-from sb3_said.planner.graphs import RecordedFunction
+from sb3_said.planner.graphs import Recording
 from sb3_said.planner.inpainting import draw_delays
 from sb3_said.planner.memory import keep_freed_memory
 from sb3_said.planner.planner import InpaintingPlanner
@@ -130,7 +130,7 @@ class PlannerTrainer:
         self.older = None if older is None else older.to(self.device)
         sizes = planner.obs_dim, planner.act_dim, planner.max_delay
         with th.random.fork_rng(devices=[]):  # initial weights are the only draws that take no generator
-            th.manual_seed(seed)
+            th.default_generator.manual_seed(seed)  # th.manual_seed would seed GPUs, too
             self.average = InpaintingPlanner(*sizes, self.config).to(self.device).requires_grad_(False)
             self.yardstick = RegressionYardstick(*sizes).to(self.device)
         windows = self.source.sample(N_NORMALIZER_WINDOWS, planner.window_length, self.generator)
@@ -155,7 +155,7 @@ class PlannerTrainer:
         self._loss_sums = th.zeros(2, device=self.device)
         self._n_losses = 0
         self._bad_update = th.full((), -1, device=self.device)
-        self._recorded = RecordedFunction(self._descend, self.device, self.generator) if on_gpu else None
+        self._recorded = Recording(self.device, self.generator) if on_gpu else None
         self._held_out = {} if held_source is None else self._draw_held_out(held_source, seed)
 
     def step(self) -> None:
@@ -169,7 +169,7 @@ class PlannerTrainer:
         for optimizer, new in ((self.optimizer, rate), (self.yardstick_optimizer, yardstick_rate)):
             (group,) = optimizer.param_groups
             group["lr"] = group["lr"].fill_(new) if isinstance(group["lr"], th.Tensor) else new
-        (losses,) = self._descend() if self._recorded is None else self._recorded()  # (2,)
+        (losses,) = self._descend() if self._recorded is None else self._recorded(self._descend)  # (2,)
         with th.no_grad():  # not recorded: the decay changes from update to update
             th._foreach_lerp_(self._averaged, self._online, 1.0 - ema_decay(self.n_updates, self.config))
             self._loss_sums += losses
@@ -322,7 +322,11 @@ class PlannerTrainer:
             module.load_state_dict(state[name])
         for name, optimizer in self._optimizers.items():
             optimizer.load_state_dict({**optimizer.state_dict(), "state": state[name]})
-        self.generator.set_state(state["generator"].cpu())
+        drawn = state["generator"].cpu()
+        if len(drawn) == len(self.generator.get_state()):
+            self.generator.set_state(drawn)
+        else:  # of another kind of device; not the draws of the beginning again
+            self.generator.manual_seed(self._settings["seed"] + self.n_updates)
         self._loss_sums.copy_(state["loss_sums"])
         self._n_losses = state["n_losses"]
         self._bad_update.fill_(-1)

@@ -38,7 +38,7 @@ def returns_to_go(
         rewards[cut] = value_fn(source.start_states()[cut], source.start_actions()[cut]).float()
     elif gamma < 1.0:
         _, episode = source.episodes.unique(return_inverse=True)
-        means = th.zeros(int(episode.max()) + 1).index_add(0, episode, rewards) / episode.bincount()
+        means = rewards.new_zeros(int(episode.max()) + 1).index_add(0, episode, rewards) / episode.bincount()
         rewards[cut] = means[episode[cut]] / (1.0 - gamma)
     else:
         raise ValueError(f"An episode that goes on has a finite value only with gamma < 1, got gamma={gamma}.")
@@ -48,7 +48,7 @@ def returns_to_go(
     for reward, is_last in zip(rewards[order].tolist(), last[order].tolist(), strict=True):
         value = reward if is_last else reward + gamma * value
         values.append(value)
-    returns = th.empty(len(source))
+    returns = th.empty(len(source), device=rewards.device)
     returns[order] = th.tensor(values)
     return returns
 

@@ -128,7 +128,7 @@ class WindowSource:
             )
         wanted = max(1, int(held_out * len(self)))
         numbers, sizes = th.unique(self.episodes, return_counts=True)
-        order = th.randperm(len(numbers), generator=th.Generator().manual_seed(seed))
+        order = th.randperm(len(numbers), generator=th.Generator().manual_seed(seed)).to(numbers.device)
         before = sizes[order].cumsum(0) - sizes[order]  # starts of the episodes drawn earlier
         drawn = numbers[order[before < wanted]]
         end = wanted - before[len(drawn) - 1]  # steps of the last one to hold out

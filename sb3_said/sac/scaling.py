@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import torch as th
 from torch import nn
@@ -11,7 +13,18 @@ SMALLEST_DEVIATION = 1e-4  # of a state's entry, in its own units
 LARGEST_SCORE = 10.0  # of SB3's VecNormalize
 
 
-class ReturnScale(nn.Module):
+class OnTheHost(nn.Module):
+    """Keeps its float64 buffers on the CPU: Apple's GPUs have no float64, and to read one would wait for any GPU."""
+
+    def _apply(self, fn: Callable[[th.Tensor], th.Tensor], recurse: bool = True) -> OnTheHost:
+        everything = self._buffers
+        self._buffers = {name: x for name, x in everything.items() if x is None or x.dtype != th.float64}
+        super()._apply(fn, recurse)
+        self._buffers = {**everything, **self._buffers}
+        return self
+
+
+class ReturnScale(OnTheHost):
     """The size of discounted returns so far, which rewards are divided by (SimbaV2, https://arxiv.org/abs/2502.15280).
 
     Of every step's running return G_t = gamma G_{t-1} + r_t it keeps mean and variance, and the largest one:
@@ -22,11 +35,14 @@ class ReturnScale(nn.Module):
     variance: th.Tensor
     count: th.Tensor
     largest: th.Tensor
+    value: th.Tensor  # () float32, where the networks are, whose CUDA graphs read it
 
     def __init__(self) -> None:
         super().__init__()
         for name, start in (("mean", 0.0), ("variance", 1.0), ("count", 1e-4), ("largest", 0.0)):
             self.register_buffer(name, th.tensor(start, dtype=th.float64))
+        self.register_buffer("value", th.ones(()), persistent=False)
+        self.register_load_state_dict_post_hook(lambda module, _: module._take_value())
 
     def update(self, returns: np.ndarray) -> None:
         """Count the running returns of a step, (n_envs,) (Chan et al.'s parallel variance)."""
@@ -37,15 +53,14 @@ class ReturnScale(nn.Module):
         self.mean.fill_(mean + difference * n / total)
         self.count.fill_(total)
         self.largest.fill_(max(float(self.largest), float(np.abs(returns).max())))
+        self._take_value()
 
-    @property
-    def value(self) -> th.Tensor:
-        """() float32, where the networks are: to read it would wait for a GPU, and no CUDA graph could have it."""
-        size = th.maximum(self.variance.sqrt(), self.largest / LARGEST_SCALED_RETURN).float()
-        return th.where(size > 0, size, 1.0)
+    def _take_value(self) -> None:
+        size = float(th.maximum(self.variance.sqrt(), self.largest / LARGEST_SCALED_RETURN).float())
+        self.value.fill_(size if size > 0 else 1.0)
 
 
-class StateNormalizer(nn.Module):
+class StateNormalizer(OnTheHost):
     """z-scores of states, (s - mean) / sd, cut at +-10. Before its first fit it changes nothing but that.
 
     :param obs_dim: of a state

@@ -82,6 +82,8 @@ class StableSAC(DelayedSAC):
             self.policy_kwargs = {**given, "optimizer_kwargs": {"fused": True}}  # Adam: a tenth of an update
         super()._setup_model()
         self.policy_kwargs = given
+        if self.use_sde and self.policy.averaged_actor is not None:
+            self.policy.averaged_actor.reset_noise()  # which does not move to a GPU with the networks
         actors = self.actor, self.policy.averaged_actor or self.actor
         self._running_stats = tuple(get_parameters_by_name(actor, ["running_"]) for actor in actors)  # of a batch norm
 

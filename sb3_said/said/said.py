@@ -250,7 +250,7 @@ class SAID(OfflineAlgorithm, StableSAC):
             raise ValueError("Nothing to learn from: the replay is empty, as after load(); give load(..., env=env).")
         before = self.policy.student
         with th.random.fork_rng(devices=[]):
-            th.manual_seed(self.seed or 0)
+            th.default_generator.manual_seed(self.seed or 0)
             self.policy.make_student(width)
             try:
                 error = distill(self, config, progress_bar)
@@ -372,7 +372,7 @@ class SAID(OfflineAlgorithm, StableSAC):
             ]
             data = replace(data, states=normalized[0], finals=normalized[1])
         with th.random.fork_rng(devices=[]):
-            th.manual_seed(self.seed or 0)
+            th.default_generator.manual_seed(self.seed or 0)
             sizes = data.states.shape[1], data.actions.shape[1]
             values = ImplicitValues(*sizes, self.policy.iql_config).to(self.device)
         return IQL(values, data, self.gamma, self.seed or 0)

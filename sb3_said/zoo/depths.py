@@ -101,7 +101,7 @@ class DepthPlanners:
         planner = self._own
         if planner is None or planner.config.depth != depth:
             with th.random.fork_rng(devices=[]):  # the same weights to begin with, whichever worker trains them
-                th.manual_seed(self.model.seed or 0)
+                th.default_generator.manual_seed(self.model.seed or 0)
                 self.model.policy.make_planner(replace(self.config, depth=depth))
             self._load_replay()
             self._update_planner(depth)

@@ -132,6 +132,15 @@ def test_a_checkpoint_holds_the_whole_run(tmp_path):
     assert (python, numpy, torch) == (random.random(), np.random.rand(), th.rand(1))
 
 
+def test_a_run_on_the_cpu_leaves_a_gpu_alone(monkeypatch):
+    monkeypatch.setattr(th.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(th.cuda, "get_rng_state_all", lambda: pytest.fail("asked of a GPU that the run has not used"))
+    assert "cuda" not in random_state()
+    monkeypatch.setattr(th.cuda, "is_initialized", lambda: True)
+    monkeypatch.setattr(th.cuda, "get_rng_state_all", lambda: ["first"])
+    assert random_state()["cuda"] == ["first"]
+
+
 def test_a_machine_of_fewer_gpus_takes_the_random_states_of_as_many(monkeypatch):
     taken, state = [], random_state()
     monkeypatch.setattr(th.cuda, "is_available", lambda: True)
@@ -248,7 +257,7 @@ def test_a_resume_after_a_callback_has_ended_training_joins_no_two_episodes(tmp_
 def test_when_checkpoints_are_written(tmp_path, monkeypatch, n_envs, save_freq, expected):
     written = []
 
-    def save(path, state):
+    def save(path, state, _):
         written.append((path, state["counters"]))
         path.touch()
 
@@ -264,7 +273,7 @@ def test_checkpoints_are_spread_by_time_and_size(tmp_path, monkeypatch):
     """Ten minutes apart, and 2,000 s apart once the file has a gigabyte."""
     written, now, size = [], [0.0], [10]
 
-    def save(path, state):
+    def save(path, state, _):
         written.append(now[0])
         with open(path, "wb") as file:
             file.truncate(size[0])
@@ -295,7 +304,7 @@ def test_a_full_disk_ends_no_training(tmp_path, monkeypatch):
     path, original = run_and_kill(make(), tmp_path), checkpoint.save_tree
     before, full = path.read_bytes(), [True]
 
-    def save(path, state):
+    def save(path, state, _):
         if full.pop() if full else False:
             raise OSError(errno.ENOSPC, "No space left on device", str(path))
         original(path, state)

@@ -1,5 +1,7 @@
 """The transformer: embeddings, adaLN-zero, masks, and the parts of a call that are shared."""
 
+import math
+
 import pytest
 import torch as th
 
@@ -23,6 +25,16 @@ def make_inputs(n=6):
     known[:, 0, :OBS] = True
     known[:, :2, OBS:] = True
     return x, known, th.linspace(0.1, 0.9, n)
+
+
+def test_nothing_is_computed_from_memory_that_was_never_written(monkeypatch):
+    """beta=0 does not keep a NaN out on every device (https://github.com/pytorch/pytorch/issues/187521)."""
+    network, (x, known, t) = make_network(), make_inputs()
+    context, modulations = network.context(x, known), network.modulations(t)
+    expected = network(x, context, modulations)
+    monkeypatch.setattr(th, "baddbmm", lambda out, a, b, beta, alpha: beta * out + alpha * th.bmm(a, b))
+    monkeypatch.setattr(th.Tensor, "new_empty", lambda self, *size: self.new_full(size, math.nan))
+    th.testing.assert_close(network(x, context, modulations), expected)
 
 
 @pytest.mark.parametrize("length", [2, 12, 24])

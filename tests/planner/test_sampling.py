@@ -174,15 +174,16 @@ def test_bfloat16_stays_close_and_chooses_as_well(prediction):
 
 
 class FakeGraph:
-    """Holds its inputs in place and runs the recorded function on them."""
+    """Holds its inputs in place and runs on them the function that it was first given."""
 
     made = 0
 
-    def __init__(self, function, device):
+    def __init__(self, device):
         FakeGraph.made += 1
-        self.function, self.inputs = function, None
+        self.function, self.inputs = None, None
 
-    def __call__(self, *inputs):
+    def __call__(self, function, *inputs):
+        self.function = self.function or function
         self.inputs = [x.clone() for x in inputs] if self.inputs is None else self.inputs
         for static, x in zip(self.inputs, inputs, strict=True):
             static.copy_(x)
@@ -201,7 +202,7 @@ class Value(th.nn.Module):
 
 
 def test_a_decision_is_recorded_once_for_its_sizes_settings_and_weights(monkeypatch):
-    monkeypatch.setattr(planner_module, "RecordedFunction", FakeGraph)
+    monkeypatch.setattr(planner_module, "Recording", FakeGraph)
     monkeypatch.setattr(FakeGraph, "made", 0)
     planner, eager, module = make_planner(), make_planner(), Value()
     monkeypatch.setattr(planner, "_can_be_recorded", lambda value_fn: True)
@@ -236,8 +237,25 @@ def test_a_decision_is_recorded_once_for_its_sizes_settings_and_weights(monkeypa
     assert len(planner._graphs) == planner_module.MAX_GRAPHS
 
 
+@pytest.mark.parametrize(
+    ("first_guess", "present"), [("none", "inpainted"), ("prior", "inpainted"), ("prior", "guessed")]
+)
+def test_one_graph_serves_all_ages(first_guess, present, monkeypatch):
+    monkeypatch.setattr(planner_module, "Recording", FakeGraph)
+    monkeypatch.setattr(FakeGraph, "made", 0)
+    planner, eager, module = (*(make_planner(first_guess=first_guess, present=present) for _ in range(2)), Value())
+    monkeypatch.setattr(planner, "_can_be_recorded", lambda value_fn: True)
+    observation, history, _, noise = make_inputs(2)
+    for age in range(DELAY + 1):
+        inputs = observation, history, th.full((2,), age), noise
+        plans = [answer(p, inputs, value_fn=module.score) for p in (planner, eager)]
+        assert plans[0].states.shape[2] == age + planner.config.horizon
+        th.testing.assert_close(plans[0], plans[1])
+    assert FakeGraph.made == 1
+
+
 def test_a_copy_records_its_own_graphs(monkeypatch):
-    monkeypatch.setattr(planner_module, "RecordedFunction", FakeGraph)
+    monkeypatch.setattr(planner_module, "Recording", FakeGraph)
     planner = make_planner()
     monkeypatch.setattr(InpaintingPlanner, "_can_be_recorded", lambda self, value_fn: True)
     before = answer(planner, value_fn=None)
@@ -256,7 +274,7 @@ def make_extra(n=3, seed=0):
 
 
 def test_a_recorded_decision_reads_the_extra_states_of_each_call(monkeypatch):
-    monkeypatch.setattr(planner_module, "RecordedFunction", FakeGraph)
+    monkeypatch.setattr(planner_module, "Recording", FakeGraph)
     monkeypatch.setattr(FakeGraph, "made", 0)
     planner, eager = (make_planner(extra_state_probability=0.5) for _ in range(2))
     monkeypatch.setattr(planner, "_can_be_recorded", lambda value_fn: True)

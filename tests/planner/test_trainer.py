@@ -325,6 +325,19 @@ def test_steps_are_those_of_a_naive_float64_trainer(precision, tolerance):
     assert (moved - naive_moved).norm() < 10 * tolerance * naive_moved.norm()
 
 
+def test_a_training_goes_on_from_another_kind_of_device():
+    first, second = make_trainer(), make_trainer()
+    first.train(3)
+    state = first.state_dict()
+    state["generator"] = th.zeros(16, dtype=th.uint8)  # a GPU's generator says no more
+    second.load_state_dict(state)
+    assert second.n_updates == 3 and not th.equal(
+        second.generator.get_state(), make_trainer().generator.get_state()
+    )  # other draws than at the beginning
+    second.train()
+    assert second.n_updates == second.gradient_steps
+
+
 @pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
 def test_recorded_updates_are_those_made_one_kernel_at_a_time():
     trainers = [make_trainer(precision="float32", device="cuda") for _ in range(2)]

@@ -78,6 +78,27 @@ def test_an_entry_that_never_moves_is_scored_0(constant, n):
     assert normalizer(states).abs().max() < 0.01
 
 
+@pytest.mark.parametrize("cls", [StableSAC, SAID])
+def test_no_float64_is_asked_of_a_device(cls):
+    """Apple's GPUs have none; the statistics are on the CPU, where to read one waits for nothing."""
+    policy, moved = make(cls=cls).learn(40).policy, []
+    before = {name: x.clone() for name, x in policy.state_dict().items()}
+    policy._apply(lambda x: (moved.append(x.dtype), x.clone())[1])
+    assert th.float32 in moved and th.float64 not in moved
+    assert list(policy.state_dict()) == list(before)
+    assert all(th.equal(x, before[name]) for name, x in policy.state_dict().items())
+    scale = copy.deepcopy(policy).to("meta").return_scale
+    assert scale.value.is_meta and scale.mean.device.type == "cpu"
+
+
+def test_a_scale_is_read_from_a_file():
+    scale, other = ReturnScale(), ReturnScale()
+    scale.update(np.array([3.0, 40.0]))
+    assert "value" not in scale.state_dict() and scale.value != 1
+    other.load_state_dict(scale.state_dict())
+    assert th.equal(other.value, scale.value)
+
+
 # --------------------------------------------------------------------------------------------------------- learning
 
 

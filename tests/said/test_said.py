@@ -48,6 +48,16 @@ class Normalized(FlattenExtractor):
         return self.norm(super().forward(observations))
 
 
+def test_only_the_cpus_generator_is_put_back_so_no_other_is_seeded(monkeypatch):
+    """Else an expert on a GPU would explore with the same noise after each training of its planner."""
+    model = make(value="iql").learn(60)
+    monkeypatch.setattr(th.cuda, "manual_seed_all", lambda _: pytest.fail("GPUs were seeded"))
+    before = th.get_rng_state()
+    model.train_planner(2)
+    assert th.equal(th.get_rng_state(), before)
+    model.distill(8, n_labels=20, own_steps=10, rounds=1, gradient_steps=4)
+
+
 def test_batch_norm_learns_nothing_from_the_planners_training():
     kwargs = {"policy_kwargs": {"net_arch": [16], "features_extractor_class": Normalized}}
     said = make(Drift(), planner_train_freq=30, **kwargs).learn(97)
