@@ -136,6 +136,11 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
                 f"gymnasium.wrappers.FlattenObservation where it has a dict of its own. {WRAPPER_ORDER}"
             )
         state_space = observation_space["observation"]
+        if not isinstance(state_space, spaces.Box) or len(state_space.shape) != 1:
+            raise ValueError(
+                f"observation was changed to {state_space}, where DelayedObservationWrapper gives a 1-D Box. "
+                f"{WRAPPER_ORDER}"
+            )
         max_delay = (observation_space["action_history"].shape or (0,))[0]
     state_box, action_box = check_task(state_space, action_space)
     if isinstance(observation_space, spaces.Dict):

@@ -51,6 +51,8 @@ class SafeSaveMixin(OffPolicyAlgorithm):
 
     task: str | None = None
     """id of the Gymnasium task that it was made for, where that is known"""
+    reads_normalized: bool = False
+    """whether its observations went through a ``VecNormalize``, whose statistics a file of their own has"""
 
     def save(self, path: PathOrFile, compact: bool = False) -> None:  # type: ignore[override]  # no exclude, include
         """Write the agent to a file, without its environment and replay buffer.
@@ -95,7 +97,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
             tree["parameters"]["policy"] = {name: _in_half(value) for name, value in parameters["policy"].items()}
         if isinstance(path, (str, os.PathLike)) and pathlib.Path(path).suffix == "":
             path = f"{os.fspath(path)}.zip"
-        save_tree(path, tree, {"task": self.task}, kind=type(self).__name__)
+        save_tree(path, tree, {"task": self.task, "reads_normalized": self.reads_normalized}, kind=type(self).__name__)
 
     @classmethod
     def load(  # type: ignore[override]  # of files, too, that are open
@@ -169,7 +171,8 @@ class SafeSaveMixin(OffPolicyAlgorithm):
             with no_larger_than(saved["parameters"]["policy"]) if own_networks else contextlib.nullcontext():
                 model._setup_model()
             restore_agent(model, saved)
-            model.task = task_of(load_metadata(path))
+            metadata = load_metadata(path)
+            model.task, model.reads_normalized = task_of(metadata), metadata["metadata"].get("reads_normalized") is True
             if model.env is not None:
                 model.set_env(model.env)
         if model.use_sde:  # its noise was drawn before the parameters were there

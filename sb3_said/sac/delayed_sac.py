@@ -132,7 +132,11 @@ class DelayedSAC(SafeSaveMixin, SAC):
         self._note_task()
 
     def _note_task(self) -> None:
-        """Remember the task's id, which files name; of environments in other processes whoever makes them may know."""
+        """Remember what files name: the task's id, and whether its observations are normalised.
+
+        The id in other processes whoever makes them may know.
+        """
+        self.reads_normalized = self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
         env = None if self.env is None else self.env.unwrapped
         if isinstance(env, DummyVecEnv) and env.envs[0].spec is not None:
             self.task = env.envs[0].spec.id

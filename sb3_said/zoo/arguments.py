@@ -57,7 +57,7 @@ def add_playing(parser: argparse.ArgumentParser, episodes: int | None, seed: int
 def add_run(parser: argparse.ArgumentParser, episodes: int) -> None:
     """Give a command line the options of one agent and how it plays."""
     parser.add_argument("run", metavar="RUN_OR_ZIP", help="run folder of a training, or an agent's .zip")
-    add_delay(parser, default="the trained one")
+    add_delay(parser, default="the trained one; of a .zip without its run folder the largest that it was built for")
     add_playing(parser, episodes)
     parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the best")
 

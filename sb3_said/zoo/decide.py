@@ -112,6 +112,7 @@ def keep_normalization(agent: Path, output: Path) -> None:
     if found is not None and not (target.exists() and target.samefile(found)):
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(found, target)
+        print(f"Wrote {target}, which belongs to it: what VecNormalize learned of its observations")
 
 
 def number_or_none(word: str) -> float | str:

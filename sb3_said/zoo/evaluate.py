@@ -51,7 +51,8 @@ def main(argv: list[str] | None = None) -> None:
     add_run(parser, episodes=50)
     parser.add_argument("--n-envs", type=int, default=8, help="episodes played side by side (default: 8)")
     parser.add_argument("--latency-calls", type=int, default=200, help="decisions to time, 0 for none (default: 200)")
-    parser.add_argument("--json", type=Path, help="where to write the numbers (default: RUN/evaluation.json)")
+    parser.add_argument("--json", type=Path, help="where to write the numbers (default: RUN/evaluation.json, of a .zip "
+                        "NAME_evaluation.json beside it; with --realtime realtime.json in their place)")  # fmt: skip
     parser.add_argument("--plot", type=Path, help="draw returns and training curves to this .png or .pdf")
     parser.add_argument("--realtime", action="store_true", help="play also without waiting for answers; --delay, 0 by "
                         "default, is then the delay without them")  # fmt: skip
@@ -104,7 +105,8 @@ def main(argv: list[str] | None = None) -> None:
     ]
     document["origin"] = origin(run)
     document |= {"period": period, "realtime": counted} if args.realtime else {}
-    target = args.json or run.folder / "evaluation.json"
+    name = "realtime.json" if args.realtime else "evaluation.json"
+    target = args.json or run.folder / (name if Path(args.run).is_dir() else f"{Path(args.run).stem}_{name}")
     write_json(target, document)
     print(f"Wrote {target}")
     if args.plot is not None:

@@ -144,11 +144,13 @@ def load_run(
     env.close()
     info = {"algo": algo, "env": env_id, "delay": delay_name(delay_process)}
     info |= {"file": str(file), "trained_steps": model.num_timesteps}
+    is_normalized = bool(hyperparams.get("normalize")) or getattr(model, "reads_normalized", False)
+    normalize = _load_normalize(file, record, make_env, is_normalized)
     changes: dict[str, Any] = {"env_kwargs": kwargs} if kwargs else {}
     for name, given in _named(wrappers):
         is_ours = "DelayedObservationWrapper" in str(name)
         changes |= {x: given[x] for x in given.keys() - DELAYS} if is_ours else {str(name): given}
-    return LoadedRun(model, make_env, _load_normalize(file, record, make_env), file.parent, info, changes)
+    return LoadedRun(model, make_env, normalize, file.parent, info, changes)
 
 
 def described(file: Path) -> tuple[str | None, str | None]:
@@ -260,12 +262,15 @@ def _check_spaces(model: BaseAlgorithm, env: gym.Env[Any, Any], file: Path) -> N
 
 
 def _load_normalize(
-    file: Path, record: Record | None, make_env: Callable[[], gym.Env[Any, Any]]
+    file: Path, record: Record | None, make_env: Callable[[], gym.Env[Any, Any]], is_needed: bool
 ) -> Callable[[Observation], Observation] | None:
     found = find_normalization(file, record)
     if found is None:
-        if record is not None and record.hyperparams.get("normalize"):
-            raise ValueError(f"{file} reads normalised observations, but {normalization_file(file)} is missing.")
+        if is_needed:
+            raise ValueError(
+                f"{file} reads normalised observations, but {normalization_file(file)} is missing. The two belong "
+                "together: put it there."
+            )
         return None
     statistics = load_normalization(found, DummyVecEnv([make_env]))
     statistics.close()

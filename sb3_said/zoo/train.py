@@ -58,7 +58,7 @@ def own_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--preset",
         choices=PRESETS,
-        help="cpu: hours on two cores; paper: the paper's table, 5 M steps and 1 M updates, with a planner for every "
+        help="cpu: hours on one core; paper: the paper's table, 5 M steps and 1 M updates, with a planner for every "
         "delay where --delay varies; quick, smoke: minutes (default: cpu)",
     )
     parser.add_argument("--seed", type=int, help="of everything drawn; part of the folder's name (default: drawn)")

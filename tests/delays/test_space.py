@@ -45,6 +45,7 @@ def with_parts(**parts):
         (spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (0,)), "The action has no entries"),
         (with_parts(action_history=spaces.Box(-1, 1, (5, 1))), spaces.Box(-1, 1, (2,)), r"gives the shape \(5, 2\)"),
         (with_parts(action_history=spaces.Box(-1, 1, (10**9, 0))), spaces.Box(-1, 1, (2,)), "gives the shape"),
+        (with_parts(observation=spaces.Box(-1, 1, (4, 3))), spaces.Box(-1, 1, (2,)), "1-D Box. Wrappers .* go below"),
         (with_parts(delay=spaces.Box(0, 5, (2,))), spaces.Box(-1, 1, (2,)), r"delay was changed to .*\(2,\)"),
     ],
 )

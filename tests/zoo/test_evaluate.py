@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,11 @@ import torch as th
 pytest.importorskip("rl_zoo3")
 
 from small_run import ENV, TINY_PLANNER, write_run
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_said import SAID, DelayedObservationWrapper
+from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.evaluation import rollout
+from sb3_said.files.normalization import normalization_file, save_normalization
 from sb3_said.zoo import enjoy, evaluate
 from sb3_said.zoo.record import Record
 from sb3_said.zoo.runs import control_period, load_run
@@ -105,6 +108,30 @@ def test_the_period_is_the_tasks_own_where_it_tells(
     with pytest.raises(SystemExit):
         evaluate.main([str(run), "--realtime", "--episodes", "1", "--device", "cpu"])
     assert "give --period" in capsys.readouterr().err
+
+
+def test_an_agent_that_reads_normalised_observations_is_not_played_without_their_scale(tmp_path: Path) -> None:
+    env = VecNormalize(
+        DummyVecEnv([lambda: DelayedObservationWrapper(gym.make(ENV), 1)]), norm_obs_keys=["observation"]
+    )
+    first, second = tmp_path / "first.zip", tmp_path / "second.zip"
+    DelayedSAC("MultiInputPolicy", env, learning_starts=10, buffer_size=100, device="cpu").learn(20).save(first)
+    DelayedSAC.load(first, device="cpu").save(second)  # without an environment it remembers, too
+    for file in (first, second):
+        with pytest.raises(ValueError, match=f"{file.stem}.normalize.zip is missing"):
+            load_run(file, "sadr", ENV, device="cpu")
+        save_normalization(normalization_file(file), env)
+        assert load_run(file, "sadr", ENV, device="cpu").normalize is not None
+
+
+def test_results_of_another_file_are_kept_apart(run: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(run, tmp_path / run.name))
+    (folder / "weighed.zip").write_bytes((folder / f"{ENV}.zip").read_bytes())
+    few = ["--episodes", "1", "--latency-calls", "0", "--device", "cpu"]
+    for path, options in ((folder, []), (folder / "weighed.zip", []), (folder, ["--realtime", "--period", "1"])):
+        evaluate.main([str(path), *few, *options])
+    for name, file in (("evaluation", ENV), ("weighed_evaluation", "weighed"), ("realtime", ENV)):
+        assert Path(json.loads((folder / f"{name}.json").read_text())["file"]).stem == file
 
 
 def test_a_shorter_delay_keeps_the_length_of_the_action_history(run: Path) -> None:
