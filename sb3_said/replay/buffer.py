@@ -331,7 +331,7 @@ class DelayedReplayBuffer(ReplayBuffer):
             raise ValueError(f"newest_fraction is a part of the buffer in (0, 1], got {newest_fraction}.")
         if self.size() == 0:
             raise ValueError(
-                "The replay buffer is empty; call learn(), or load_replay_buffer() after load(), before training a planner."
+                "The replay buffer is empty; call learn(), or load_replay_buffer() after load(), before its planner learns."
             )
         n_newest = max(int(self.size() * newest_fraction), 1)
         n_rows = self.size() - n_newest if older else n_newest
