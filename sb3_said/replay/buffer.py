@@ -330,9 +330,7 @@ class DelayedReplayBuffer(ReplayBuffer):
         if not 0.0 < newest_fraction <= 1.0:
             raise ValueError(f"newest_fraction is a part of the buffer in (0, 1], got {newest_fraction}.")
         if self.size() == 0:
-            raise ValueError(
-                "The replay buffer is empty; call learn(), or load_replay_buffer() after load(), before its planner learns."
-            )
+            raise ValueError("The replay buffer is empty; call learn() first, or load_replay_buffer() after load().")
         n_newest = max(int(self.size() * newest_fraction), 1)
         n_rows = self.size() - n_newest if older else n_newest
         if n_rows == 0:
