@@ -16,7 +16,6 @@ from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.first_guess import GUESS_BATCH_SIZE, fit_first_guess
 from sb3_said.planner.graphs import Recording
 from sb3_said.planner.inpainting import draw_delays
-from sb3_said.planner.memory import keep_freed_memory
 from sb3_said.planner.planner import InpaintingPlanner
 from sb3_said.planner.values import scaled_values, window_weight
 from sb3_said.planner.yardstick import RegressionYardstick
@@ -112,8 +111,6 @@ class PlannerTrainer:
         self._has_guessed = False
         self.device = planner.device
         on_gpu = self.device.type == "cuda"
-        if not on_gpu:
-            keep_freed_memory()
         self.generator = th.Generator(self.device if on_gpu else "cpu").manual_seed(seed)
         self._settings = {
             **planner.config.weight_settings(),
