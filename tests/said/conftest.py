@@ -4,7 +4,7 @@ import pytest
 from small_agent import make
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def small_first_guesses():
     """A planner's first guess is as small as the planners here, and takes half of the time."""
     with pytest.MonkeyPatch.context() as patched:
