@@ -194,9 +194,8 @@ def belief_error(belief: Belief, windows: Windows, delay: int) -> float:
         raise ValueError(f"No window has {delay + 1} steps of one episode, which an error at delay {delay} needs.")
     states, actions = windows.states[reach], windows.actions[reach]
     history = F.pad(actions[:, :delay], (0, 0, belief.max_delay - delay, 0))  # (B, D, act_dim)
-    found = belief.present(states[:, 0], history, th.full((len(states),), delay, device=states.device)).to(
-        states.device
-    )
+    ages = th.full((len(states),), delay, device=states.device)
+    found = belief.present(states[:, 0], history, ages).to(states.device)
     spread = windows.states[windows.valid].std(0).clamp(min=1e-6)
     return float((((found - states[:, delay]) / spread) ** 2).mean().sqrt())
 

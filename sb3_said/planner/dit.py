@@ -64,7 +64,8 @@ class DiTBlock(nn.Module):
         m, length, d_model = x.shape
         qkv = self.qkv(x).view(m, length, 3, -1, HEAD_DIM).permute(2, 0, 3, 1, 4).contiguous()
         q, k, v = qkv.view(3, -1, length, HEAD_DIM).unbind()  # each (M * heads, L, HEAD_DIM)
-        # Plain products: windows are short, and PyTorch's fused attention costs CPUs more in both directions.
+        # Plain products: windows are short, and PyTorch's fused attention costs CPUs more in both directions. The first
+        # argument counts for nothing, but on MPS a NaN in it would.
         scores = th.baddbmm(q.new_zeros(1), q, k.mT, beta=0, alpha=HEAD_DIM**-0.5)  # (M * heads, L, L)
         if bias is not None:
             scores = (scores.view(m, -1, length, length) + bias).view(-1, length, length)

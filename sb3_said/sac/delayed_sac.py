@@ -134,7 +134,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
     def _note_task(self) -> None:
         """Remember what files name: the task's id, and whether its observations are normalised.
 
-        The id in other processes whoever makes them may know.
+        Environments in other processes do not tell the id; whoever makes them may know it.
         """
         self.reads_normalized = self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
         env = None if self.env is None else self.env.unwrapped

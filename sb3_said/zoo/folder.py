@@ -58,8 +58,11 @@ def drop_undone_episodes(checkpoint: Path) -> None:
 
     The episode during which the checkpoint was written is missing from the files.
     """
-    for name, size in load_metadata(checkpoint)["metadata"]["monitors"].items():
-        os.truncate(checkpoint.with_name(name), size)  # in place: the environments have opened it, to append to it
+    noted = load_metadata(checkpoint)["metadata"].get("monitors")
+    for file in checkpoint.parent.glob("*.monitor.csv"):
+        size = noted.get(file.name) if isinstance(noted, dict) else None
+        if type(size) is int and 0 <= size < file.stat().st_size:
+            os.truncate(file, size)  # in place: the environments have opened it, to append to it
 
 
 def find_agent(path: Path) -> tuple[Path, Record | None]:

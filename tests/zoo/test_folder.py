@@ -5,12 +5,14 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from threading import Barrier
+from typing import Any
 
 import pytest
 
 pytest.importorskip("rl_zoo3")
 
-from sb3_said.zoo.folder import claim_folder, hold_folder
+from sb3_said.files.archive import save_tree
+from sb3_said.zoo.folder import claim_folder, drop_undone_episodes, hold_folder
 
 
 def test_trainings_that_start_together_claim_folders_of_their_own(tmp_path: Path) -> None:
@@ -37,3 +39,16 @@ def test_a_folder_is_held_by_one_and_cleared_of_killed_writes(tmp_path: Path) ->
         hold_folder(tmp_path)
     lock.release()
     hold_folder(tmp_path).release()
+
+
+@pytest.mark.parametrize(
+    "noted", [None, 3, {"../victim": 0, "victim": 0, "0.monitor.csv": -1}, {"0.monitor.csv": 10**12}]
+)
+def test_a_forged_note_cuts_and_lengthens_nothing(noted: Any, tmp_path: Path) -> None:
+    (run := tmp_path / "run").mkdir()
+    files = [tmp_path / "victim", run / "victim", run / "0.monitor.csv"]
+    for file in files:
+        file.write_text("12345")
+    save_tree(run / "checkpoint.zip", {}, {"monitors": noted})
+    drop_undone_episodes(run / "checkpoint.zip")
+    assert [file.read_text() for file in files] == ["12345"] * 3
