@@ -81,6 +81,11 @@ class ControlLoop:
         simulate: Callable[[float], int] | None = None,
     ):
         state_space, max_delay = check_spaces(model.observation_space, model.action_space)
+        if normalize is None and getattr(model, "reads_normalized", False):
+            raise ValueError(
+                "The model reads observations that a VecNormalize has normalised: give normalize=venv.normalize_obs; or "
+                "normalize=lambda obs: obs, where they are so already."
+            )
         self._asking = Asking(model, max_delay, deterministic, normalize)
         if not (period > 0 and action_delay >= 0):
             raise ValueError(f"period is {period} and action_delay {action_delay}, expected above 0 and at least 0.")

@@ -39,7 +39,7 @@ class ModelProcess:
         self._process.start()
         theirs.close()
         self._lock = threading.Lock()  # an answer belongs to the question before it
-        self.observation_space, self.action_space = self._receive(
+        self.observation_space, self.action_space, self.reads_normalized = self._receive(
             ' It ended as it began: does the script make its ModelProcess below `if __name__ == "__main__":`?'
         )
 
@@ -102,7 +102,8 @@ def _serve(load: Callable[[], Any], pipe: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         model = load()
-        pipe.send(((model.observation_space, model.action_space), None))
+        told = model.observation_space, model.action_space, getattr(model, "reads_normalized", False)
+        pipe.send((told, None))
     except Exception as error:  # told to who asked
         pipe.send((None, f"{type(error).__name__}: {error}"))
         return

@@ -173,6 +173,15 @@ def test_a_model_that_fails_is_heard_of_where_the_robot_is():
         ControlLoop(Failing(TASK, 2), 1, normalize=lambda obs: obs | {"observation": ZEROS[None] + 1})
 
 
+def test_a_model_that_reads_normalised_observations_needs_their_scale():
+    class Normalised(Recorder):
+        reads_normalized = True
+
+    with pytest.raises(ValueError, match=r"give normalize=venv\.normalize_obs"):
+        ControlLoop(Normalised(TASK, 2), 1)
+    ControlLoop(Normalised(TASK, 2), 1, normalize=lambda obs: obs).close()
+
+
 def test_a_closed_loop_says_so_and_leaves_no_thread():
     loop = ControlLoop(Recorder(TASK, 2), 1)
     loop.close()

@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 import pytest
 from recorder import Planning, assert_honest
-from robot import PERIOD, Cold, Sum, fail, live, make_task
+from robot import PERIOD, Cold, Normalized, Sum, fail, live, make_task
 
 from sb3_said.realtime import ControlLoop, ModelProcess, ticks
 from sb3_said.realtime.process import _serve
@@ -100,7 +100,7 @@ def test_a_loop_beside_a_robot_at_50_hz(by, record_property):
 
 def test_a_model_in_a_process_answers_as_here():
     observations = np.arange(8, dtype=np.float64).reshape(2, 4) / 10
-    with ModelProcess(partial(Sum, 0.5)) as model:
+    with ModelProcess(partial(Normalized, 0.5)) as model:
         np.testing.assert_array_equal(model.predict(observations)[0], Sum(0.5).predict(observations)[0])
         assert model.predict_plan(observations).shape == (2, 1, 1) and model.warmup() is None
         with pytest.raises(RuntimeError, match="ValueError: nine is too much"):
@@ -108,7 +108,9 @@ def test_a_model_in_a_process_answers_as_here():
         with ThreadPoolExecutor(4) as threads:  # each gets its own answer
             answers = threads.map(lambda k: float(model.predict(observations[:1] + k)[0][0, 0]), np.arange(100) / 100)
         np.testing.assert_allclose([*answers], 1.1 + 0.04 * np.arange(100), rtol=1e-6)
-        with ControlLoop(model, 1, answer_steps=0) as loop:
+        with pytest.raises(ValueError, match="give normalize="):
+            ControlLoop(model, 1)
+        with ControlLoop(model, 1, answer_steps=0, normalize=lambda obs: obs) as loop:
             loop.observe(observations[0], n_executed=0)
             assert loop.wait(60)
             np.testing.assert_array_equal(loop.act(0), Sum(0.5).predict(observations[:1])[0][0])

@@ -61,6 +61,12 @@ class Sum:
         return np.float32(observation.sum(1, keepdims=True) + self.offset), None
 
 
+class Normalized(Sum):
+    """Says that its observations are normalised."""
+
+    reads_normalized = True
+
+
 class Cold(Sum):
     """Takes a second for its first answer, as one does that compiles or reads from a disk."""
 
