@@ -83,7 +83,7 @@ class ControlLoop:
         state_space, max_delay = check_spaces(model.observation_space, model.action_space)
         if normalize is None and getattr(model, "reads_normalized", False):
             raise ValueError(
-                "The model reads observations that a VecNormalize has normalised: give normalize=venv.normalize_obs, or "
+                "The model reads observations that VecNormalize has normalised: give normalize=venv.normalize_obs, or "
                 "normalize=lambda obs: obs where they are so already."
             )
         self._asking = Asking(model, max_delay, deterministic, normalize)
