@@ -277,8 +277,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     p.add_argument("--json", type=Path, required=True, help="file of the numbers, read and written")
     args = p.parse_args(argv)
     th.set_num_threads(args.num_threads)
-    opened = partial(open_run, args.run) if args.log is None else partial(open_with_log, args.run, args.log)
-    model = opened(device=args.device)
+    model = open_run(args.run, args.device) if args.log is None else open_with_log(args.run, args.log, args.device)
     preset = preset_of(model, args)
     if preset.first_guess == "none" and {"guessed present", GUESS_ALONE} & {*args.rows}:
         p.error(f"This planner has no first guess: leave 'guessed present' and {GUESS_ALONE!r} out of --rows.")

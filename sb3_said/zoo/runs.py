@@ -127,15 +127,15 @@ def load_run(
         except TypeError as error:
             raise ValueError(f"{env_id} cannot be made with {kwargs}: {error}") from error
 
-    wrappers = record.wrappers if record is not None else []
-    if delay is not None or (record is None and _process_of(make_task()) is None):  # a task may be registered with one
+    task, wrappers = make_task(), record.wrappers if record is not None else []
+    if delay is not None or (record is None and _process_of(task) is None):  # a task may be registered with one
         wrappers = _with_delay(wrappers, delay, model)
-    wrap = make_wrapper(wrappers)
+    wrap = make_wrapper(wrappers) or (lambda task: task)
 
     def make_env() -> gym.Env[Any, Any]:
-        return make_task() if wrap is None else wrap(make_task())
+        return wrap(make_task())
 
-    env = make_env()
+    env = wrap(task)
     _check_spaces(model, env, file)
     delay_process = _process_of(env) or FixedDelay(0)
     if isinstance(model, DelayedSAC):

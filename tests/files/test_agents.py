@@ -669,7 +669,7 @@ def test_what_is_too_large_for_half_precision_stays_whole(tmp_path):
 
 def test_the_file_names_the_task(tmp_path):
     make_sac().learn(20).save(tmp_path / "agent.zip")
-    assert load_metadata(tmp_path / "agent.zip")["metadata"]["task"] == "Pendulum-v1"
+    assert load_metadata(tmp_path / "agent.zip")["metadata"] == {"task": "Pendulum-v1", "reads_normalized": False}
     loaded = DelayedSAC.load(tmp_path / "agent.zip", device="cpu")
     loaded.save(tmp_path / "again.zip")  # without an environment
     assert loaded.task == load_metadata(tmp_path / "again.zip")["metadata"]["task"] == "Pendulum-v1"
@@ -680,5 +680,5 @@ def test_a_task_that_would_import_a_module_is_none(task, tmp_path):
     model = make_sac().learn(20)
     model.task = task
     model.save(tmp_path / "agent.zip")
-    assert load_metadata(tmp_path / "agent.zip")["metadata"]["task"] == task
+    assert load_metadata(tmp_path / "agent.zip")["metadata"] == {"task": task, "reads_normalized": False}
     assert DelayedSAC.load(tmp_path / "agent.zip", device="cpu").task is None

@@ -668,8 +668,9 @@ def test_bad_observations_are_refused_before_anything_is_computed(obs, message, 
 
     monkeypatch.setattr(model.policy.actor, "forward", computed)
     state = th.get_rng_state()
-    with pytest.raises(ValueError, match=message):
-        model.predict(obs)
+    for deterministic in (True, False):
+        with pytest.raises(ValueError, match=message):
+            model.predict(obs, deterministic=deterministic)
     assert th.equal(state, th.get_rng_state())
 
 

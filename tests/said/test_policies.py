@@ -171,6 +171,14 @@ def test_other_answers_follow_the_global_seed(trained, who):
 
 
 @pytest.mark.parametrize("deterministic", [True, False])
+def test_bad_observations_are_refused_before_planning(trained, deterministic, monkeypatch):
+    monkeypatch.setattr(trained.policy.planner, "plan", lambda *_, **__: pytest.fail("the planner was asked"))
+    obs = rows_of(observe())[3] | {"observation": np.array([np.nan, 0.0], np.float32)}  # test_delayed_sac.py has others
+    with pytest.raises(ValueError, match="observation has entries that are NaN"):
+        trained.predict(obs, deterministic=deterministic)
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
 @pytest.mark.parametrize("temperature", [0.0, 0.5])
 @pytest.mark.parametrize("who", ["planner", "expert"])
 def test_what_no_network_can_answer_is_refused(saved, who, temperature, deterministic):
