@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from measure import progress
+from measure import print_table, progress
 from what_diffusion_buys import agent_of, make_env, open_run, open_with_log
 
 from sb3_said import SAID
@@ -93,14 +93,16 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
 def show(rows: dict[str, Any]) -> None:
     """Print a Markdown table."""
     delays = list(rows["planner"]["returns"])
-    print("| | " + " | ".join(f"delay {d}" for d in delays) + " | kept | predict p50, p99 ms | ONNX p50, p99 ms |")
-    print("|---" * (len(delays) + 4) + "|")
     whole = np.mean([rows["planner"]["returns"][d] for d in delays])
+    table = []
     for name, row in rows.items():
-        texts = [str(confidence_interval(row["returns"][d])) for d in delays]
-        kept = np.mean([row["returns"][d] for d in delays]) / whole
-        times = [f"{row[k]['p50_ms']:.2f}, {row[k]['p99_ms']:.2f}" if k in row else "-" for k in ("predict", "onnx")]
-        print(f"| {name} | " + " | ".join(texts) + f" | {kept:.3f} | " + " | ".join(times) + " |")
+        cells = {f"delay {d}": str(confidence_interval(row["returns"][d])) for d in delays}
+        cells["kept"] = f"{np.mean([row['returns'][d] for d in delays]) / whole:.3f}"
+        for key, who in (("predict", "predict"), ("onnx", "ONNX")):
+            times = f"{row[key]['p50_ms']:.2f}, {row[key]['p99_ms']:.2f}" if key in row else "-"
+            cells[f"{who} p50, p99 ms"] = times
+        table.append({"": name, **cells})
+    print_table(table)
 
 
 if __name__ == "__main__":

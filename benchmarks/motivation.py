@@ -29,6 +29,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
+from measure import print_table
 from tqdm import tqdm
 
 from sb3_said import SAID, DelayedObservationWrapper, PlannerConfig
@@ -200,9 +201,8 @@ def draw(path: Path, document: dict[str, Any], table: dict[str, list[Summary]]) 
 
 def show(rows: dict[str, list[str]], what: str, delays: list[int]) -> None:
     """Print a Markdown table over the delays."""
-    print(f"\n| {what} | " + " | ".join(map(str, delays)) + " |\n|---|" + "---:|" * len(delays))
-    for name, row in rows.items():
-        print(f"| {name} | " + " | ".join(row) + " |")
+    print()
+    print_table([{what: name, **dict(zip(map(str, delays), row, strict=True))} for name, row in rows.items()])
 
 
 def main(argv: list[str] | None = None) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measure import print_table
 
 from sb3_said.evaluation import plots
 from sb3_said.offline import normalized_score
@@ -86,18 +87,19 @@ def table(files: list[tuple[str, str | None, Path]]) -> dict[tuple[str, str], di
 
 def show(found: dict[tuple[str, str], dict[str, Seeds]]) -> None:
     """Print a Markdown table: a row for each set and agent."""
-    columns = [f"delay {d}" for d in DELAYS] + [f"kept at {d}" for d in DELAYS[1:]] + ["paper"]
-    print(f"| set | agent | {' | '.join(columns)} |\n|---|---|" + "---|" * len(columns))
+    table = []
     for (kind, env), rows in found.items():
         for agent, seeds in rows.items():
-            cells = []
+            cells = {"set": f"{env} {kind}", "agent": agent}
             for delay in DELAYS:
                 scores = [float(normalized_score(float(np.mean(returns)), env)) for returns in seeds.get(delay, [])]
                 each = f" [{', '.join(f'{score:.1f}' for score in scores)}]" if len(scores) > 1 else ""
-                cells.append(f"{np.mean(scores):.1f}{each}" if scores else "")
-            cells += [f"{np.mean(seeds[d]) / np.mean(seeds[0]):.2f}" if d in seeds else "" for d in DELAYS[1:]]
-            paper = PAPER.get((kind, env), {}).get(agent, ())
-            print(f"| {env} {kind} | {agent} | {' | '.join(cells)} | {', '.join(map(str, paper))} |")
+                cells[f"delay {delay}"] = f"{np.mean(scores):.1f}{each}" if scores else ""
+            for d in DELAYS[1:]:
+                cells[f"kept at {d}"] = f"{np.mean(seeds[d]) / np.mean(seeds[0]):.2f}" if d in seeds else ""
+            cells["paper"] = ", ".join(map(str, PAPER.get((kind, env), {}).get(agent, ())))
+            table.append(cells)
+    print_table(table)
 
 
 def main(argv: list[str] | None = None) -> dict[tuple[str, str], dict[str, Seeds]]:

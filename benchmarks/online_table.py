@@ -22,6 +22,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from measure import print_table
 
 from sb3_said.evaluation import confidence_interval, plots, stratified_interval
 from sb3_said.zoo.cells import Cell, Results, manners_of
@@ -87,7 +88,7 @@ def show(found: Mapping[str, Mapping[str, Seeds]]) -> None:
     delays = list(dict.fromkeys(d for rows in found.values() for seeds in rows.values() for one in seeds for d in one))
     fixed, random = ([d for d in delays if isinstance(d, kind)] for kind in (int, str))
     columns = [*map(str, delays), "mean of fixed", "seeds", "mean of random", "worst tenth", "falls", "change"]
-    print(f"| task | agent | {' | '.join(columns)} |\n|---|---|{'---|' * len(columns)}")
+    table = []
     for env, rows in found.items():
         for row, seeds in rows.items():
             of_fixed, manners = returns_over(seeds, fixed), manners_of(cell for one in seeds for cell in one.values())
@@ -97,11 +98,13 @@ def show(found: Mapping[str, Mapping[str, Seeds]]) -> None:
             cells += [written(returns_over(seeds, random)) if random else "-", f"{manners.worst_tenth:,.0f}"]
             cells += ["-" if manners.ended is None else f"{manners.ended:.1%}"]
             cells += ["-" if manners.change is None else f"{manners.change:.3f}"]
-            print(f"| {env} | {row} | {' | '.join(cells)} |")
+            table.append({"task": env, "agent": row, **dict(zip(columns, cells, strict=True))})
         paper = dict(zip(PAPER_DELAYS, PAPER.get(env, ()), strict=False))
-        cells = [f"{paper[d][0]:,} ± {paper[d][1]}" if d in paper else "" for d in delays]
         if paper:
-            print(f"| {env} | SAID, paper | {' | '.join(cells)} |{' |' * (len(columns) - len(cells))}")
+            cells = [f"{paper[d][0]:,} ± {paper[d][1]}" if d in paper else "" for d in delays]
+            cells += [""] * (len(columns) - len(delays))
+            table.append({"task": env, "agent": "SAID, paper", **dict(zip(columns, cells, strict=True))})
+    print_table(table)
 
 
 def plot(found: Mapping[str, Mapping[str, Seeds]], path: Path) -> None:

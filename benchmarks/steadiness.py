@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measure import print_table
 
 from sb3_said.files.atomic import write_json
 
@@ -78,11 +79,18 @@ def main(argv: list[str] | None = None) -> dict[str, dict[str, Any]]:
         except ValueError as error:
             p.error(str(error))
     rows = {name: steadiness(runs, args.last) for name, runs in groups.items()}
-    print("| | steps | mean | sd / mean, worst run | bad evaluations | worst run / mean |\n|---|---|---|---|---|---|")
-    for name, row in rows.items():
-        steps = ", ".join(f"{n:,}" for n in row["steps"])
-        print(f"| {name} | {steps} | {row['mean']:,.0f} | {row['sd / mean']:.2f} | {row['bad']} of "
-              f"{row['evaluations']} | {row['worst run']:.2f} |")  # fmt: skip
+    table = [
+        {
+            "": name,
+            "steps": ", ".join(f"{n:,}" for n in row["steps"]),
+            "mean": f"{row['mean']:,.0f}",
+            "sd / mean, worst run": row["sd / mean"],
+            "bad evaluations": f"{row['bad']} of {row['evaluations']}",
+            "worst run / mean": row["worst run"],
+        }
+        for name, row in rows.items()
+    ]
+    print_table(table)
     if args.json is not None:
         write_json(args.json, [run for runs in groups.values() for run in runs])
     return rows

@@ -45,7 +45,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
-from measure import progress
+from measure import print_table, progress
 from motivation import GUESS_ALONE, INPAINTING, AllAtOnce, GuessAlone, dict_of, load_agent
 from tqdm import tqdm
 
@@ -309,15 +309,15 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
 
 def show(returns: dict[str, dict[str, list[float]]], args: argparse.Namespace) -> None:
     """Print a Markdown table: intervals over the planners' seeds, over episodes where there is one agent."""
-    print("| return at delay | " + " | ".join(map(str, args.delays)) + " |")
-    print("|---" * (len(args.delays) + 1) + "|")
+    table = []
     for row in args.rows:
         seeds = [None] if row in ALONE else args.seeds
-        texts = []
+        cells = {}
         for delay in args.delays:
             values = np.array([returns[f"{row}/{seed}"][str(delay)] for seed in seeds])  # (n_seeds, n_episodes)
-            texts.append(str(confidence_interval(values if len(values) > 1 else values[0])))
-        print(f"| {row} | " + " | ".join(texts) + " |")
+            cells[str(delay)] = str(confidence_interval(values if len(values) > 1 else values[0]))
+        table.append({"return at delay": row, **cells})
+    print_table(table)
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
-from measure import progress
+from measure import print_table, progress
 from motivation import OldObservation, load_agent
 
 from sb3_said import SAID, DelayedObservationWrapper
@@ -256,11 +256,14 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
 def show(document: dict[str, Any]) -> None:
     """Print a Markdown table for each delay."""
     for delay, rows in document["delays"].items():
-        print(f"\n| delay {delay} | return | error of the present | distance to the data |\n|---|---|---|---|")
-        for name, row in rows.items():
-            numbers = f"{row['present_error']:.3f} | {row['distance']:.3f}"
-            print(f"| {name} | {confidence_interval(row['returns'])} | {numbers} |")
-        print(f"| data | | | {document['data_distance']:.3f} |")
+        cells = [
+            (name, str(confidence_interval(row["returns"])), f"{row['present_error']:.3f}", f"{row['distance']:.3f}")
+            for name, row in rows.items()
+        ]
+        cells.append(("data", "", "", f"{document['data_distance']:.3f}"))
+        header = (f"delay {delay}", "return", "error of the present", "distance to the data")
+        print()
+        print_table([dict(zip(header, row, strict=True)) for row in cells])
 
 
 if __name__ == "__main__":
