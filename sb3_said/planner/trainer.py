@@ -192,6 +192,7 @@ class PlannerTrainer:
         drawn = self.average.normalizer, self.config, n_updates, self.generator
         if not fit_first_guess(guess, self.source, *drawn, progress_bar, should_stop, self.older):
             return False
+        self.older = None  # which on a GPU is another copy of the replay
         guess.requires_grad_(False)
         if self.online.prior is not None:
             self.online.fit_prior(self.source.sample(N_PRIOR_WINDOWS, self.online.window_length, self.generator))

@@ -173,7 +173,7 @@ def test_other_answers_follow_the_global_seed(trained, who):
 @pytest.mark.parametrize("deterministic", [True, False])
 def test_bad_observations_are_refused_before_planning(trained, deterministic, monkeypatch):
     monkeypatch.setattr(trained.policy.planner, "plan", lambda *_, **__: pytest.fail("the planner was asked"))
-    obs = rows_of(observe())[3] | {"observation": np.array([np.nan, 0.0], np.float32)}  # test_delayed_sac.py has others
+    obs = rows_of(observe())[3] | {"observation": np.array([np.nan, 0.0], np.float32)}  # others: test_observations
     with pytest.raises(ValueError, match="observation has entries that are NaN"):
         trained.predict(obs, deterministic=deterministic)
 

@@ -42,6 +42,11 @@ def rows_of(batch):
     return [{key: value[i] for key, value in batch.items()} for i in range(len(batch["delay"]))]
 
 
+def observation(**kwargs):
+    """Return one observation amid an episode of ``delayed(**kwargs)``."""
+    return rows_of(observe(6, delayed(**kwargs)))[-1]
+
+
 def answer(model, obs, deterministic=True):
     return model.predict(obs, deterministic=deterministic)[0]
 

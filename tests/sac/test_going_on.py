@@ -1,0 +1,139 @@
+"""Learning goes on where it was cut short: the replay holds what happened, whoever ended or disturbed a rollout."""
+
+import copy
+from functools import partial
+
+import numpy as np
+import pytest
+from kill import Kill, Killed
+from small_agent import make as make_agent
+from small_task import Drift, delayed
+from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_said import DelayedSAC, StableSAC
+from sb3_said.delays.space import UNDELAYED
+
+make = partial(make_agent, cls=DelayedSAC)
+
+
+class Stop(BaseCallback):
+    """Ends training at a step."""
+
+    def __init__(self, at):
+        super().__init__()
+        self.at = at
+
+    def _on_step(self):
+        return self.num_timesteps < self.at
+
+
+def record(model, monkeypatch):
+    """Return a list that will hold, step for step, the observations that the replay is given and the true states."""
+    rows, add = [], model.replay_buffer.add
+
+    def note(obs, next_obs, action, reward, done, infos):
+        obs, next_obs = copy.deepcopy((obs, next_obs))
+        if not isinstance(obs, dict):
+            obs, next_obs = {"observation": obs}, {"observation": next_obs}
+        after = infos[0].get(UNDELAYED, next_obs["observation"][0])
+        rows.append((obs, next_obs, after))
+        add(obs, next_obs, action, reward, done, infos)
+
+    monkeypatch.setattr(model.replay_buffer, "add", note)
+    return rows
+
+
+def assert_replay_is_what_happened(model, rows):
+    """Compare every row, and the steps of the task itself, with what the replay makes of them."""
+    buffer = model.replay_buffer
+    assert buffer.size() == len(rows) and buffer.n_envs == 1
+    batch = buffer._get_samples(np.arange(len(rows)))
+    states, history = batch.observations, "action_history"
+    if not buffer.is_delayed:
+        states = {"observation": states, UNDELAYED: states}
+    for t, (obs, next_obs, after) in enumerate(rows):
+        for key, value in obs.items():
+            np.testing.assert_array_equal(states[key][t], value[0], err_msg=f"{key} at {t}")
+        if history in obs:
+            np.testing.assert_array_equal(next_obs[history][0, :-1], obs[history][0, 1:], err_msg=f"at {t}")
+        state, action = states[UNDELAYED][t].numpy(), 2.0 * batch.actions[t].numpy()
+        np.testing.assert_allclose(after, 0.9 * state + 0.1 * np.array([action[0], state[0]]), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("make_env", [Drift, lambda: delayed(4), lambda: delayed(1)], ids=["plain", "4", "1"])
+@pytest.mark.parametrize("end", [lambda: StopTrainingOnMaxEpisodes(2), lambda: Stop(15), lambda: Kill(15)])
+def test_learning_goes_on_after_a_rollout_that_was_cut_short(make_env, end, monkeypatch):
+    model = make(make_env(), learning_starts=100)
+    rows = record(model, monkeypatch)
+    try:
+        model.learn(100, callback=end())
+    except Killed:
+        pass
+    stopped = model.num_timesteps  # with the step that SB3 has not stored
+    assert len(rows) == stopped - 1
+    model.learn(30, reset_num_timesteps=False)
+    assert_replay_is_what_happened(model, rows)
+    steps = model.replay_buffer.steps[: len(rows), 0]
+    assert steps.max() == 11 and steps[stopped - 1] == 0
+    assert model.replay_buffer.window_source().remaining.max() == 12
+
+
+def test_consecutive_learning_goes_on_amid_an_episode(monkeypatch):
+    model = make(delayed(4), learning_starts=100)
+    rows = record(model, monkeypatch)
+    for _ in range(4):
+        model.learn(10, reset_num_timesteps=False)
+    assert_replay_is_what_happened(model, rows)
+    assert model.replay_buffer.steps[:40, 0].tolist() == [*range(12), *range(12), *range(12), *range(4)]
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+@pytest.mark.parametrize("make_env", [Drift, lambda: delayed(4)], ids=["plain", "delayed"])
+def test_learning_goes_on_where_the_replay_has_not_seen_the_episode(make_env, normalize, monkeypatch, tmp_path):
+    env = make_vec_env(make_env, n_envs=1)
+    env = VecNormalize(env, norm_obs_keys=["observation"] if make_env is not Drift else None) if normalize else env
+    model = make(env, learning_starts=100).learn(20)
+    model.save(tmp_path / "agent")
+    model.replay_buffer.reset()
+    rows = record(model, monkeypatch)
+    model.learn(30, reset_num_timesteps=False)
+    assert_replay_is_what_happened(model, rows)
+
+    model.learn(20)
+    loaded = DelayedSAC.load(tmp_path / "agent", env=model.env, force_reset=False, device="cpu")
+    rows = record(loaded, monkeypatch)
+    loaded.learn(30, reset_num_timesteps=False)
+    assert loaded.num_timesteps == 50 and len(rows) == 30
+    if make_env is not Drift:  # where nothing is delayed, force_reset=False is the caller's promise, as in SB3
+        assert_replay_is_what_happened(loaded, rows)
+
+
+@pytest.mark.parametrize("make_env", [Drift, lambda: delayed(4)], ids=["plain", "4"])
+@pytest.mark.parametrize("cls", [DelayedSAC, StableSAC])
+def test_a_callback_may_play_the_environment_after_a_step(make_env, cls, monkeypatch):
+    class Play(BaseCallback):
+        def _on_step(self):
+            if self.n_calls % 15 == 0:
+                with self.model.borrowed_env() as env:
+                    env.reset()
+                    env.step(np.array([env.action_space.sample()]))
+            return True
+
+    model = make(make_env(), cls=cls)
+    rows = record(model, monkeypatch)
+    model.learn(70, callback=Play())
+    assert model.num_timesteps == 70 and len(rows) == 70 - 4  # whose observations are gone
+    assert_replay_is_what_happened(model, rows)
+
+
+def test_a_replay_emptied_during_training_is_refused_with_what_to_do():
+    class Forget(BaseCallback):
+        def _on_step(self):
+            if self.num_timesteps == 30:
+                self.model.replay_buffer.reset()
+            return True
+
+    with pytest.raises(ValueError, match=r"between two calls of learn\(\)"):
+        make(delayed(4)).learn(60, callback=Forget())
