@@ -81,7 +81,7 @@ class Ledger:
         self.n_sent = self.n_missing = 0
         self.is_answered = False
         self.observation: np.ndarray | None = None
-        self.captured, self._n_shown = began, 0
+        self.captured, self._n_shown, self._is_stamped = began, 0, True
         self._last = self.safe_action
         self._planned: dict[int, np.ndarray] = {}
         self._history = np.zeros((self.max_delay, *self.safe_action.shape), np.float32)
@@ -127,13 +127,13 @@ class Ledger:
                 "reset(); reset the robot's count, too, and drop observations of the episode before."
             )
         n_executed = int(n_executed)  # numbers of a packet are NumPy's, and those of few bits overflow
+        if n_executed < self._n_shown and (capture_time is None or not self._is_stamped):
+            return False
         if capture_time is not None:
             self.captured = capture_time
-        elif n_executed < self._n_shown:
-            return False
         elif n_executed == self._n_shown < self.n_sent and np.array_equal(state, self.observation):  # type: ignore[arg-type]
             return False  # a frozen sensor; a robot that has executed all may as well stand still
-        self.observation, self._n_shown = state, n_executed
+        self.observation, self._n_shown, self._is_stamped = state, n_executed, capture_time is not None
         return True
 
     def request(self, n_steps: int) -> Request | None:

@@ -82,6 +82,18 @@ def test_a_stamp_later_than_it_can_be_is_dropped_and_spoils_nothing():
     assert ledger.observation == 1.0 and ledger.observe([3.0], 2, None, latest=2)
 
 
+def test_a_stamp_does_not_bring_back_what_an_unstamped_observation_has_overtaken():
+    ledger = make()
+    send(ledger, 4)  # at 0, 1, 2 and 3
+    assert ledger.observe([1.0], 0.5, None) and ledger.observe([2.0], None, 4)
+    assert not ledger.observe([3.0], 1.5, None)  # two actions: younger than the stamped one, older than the other
+    assert (ledger.observation, ledger.age) == (np.float32(2.0), 0)
+    assert ledger.observe([4.0], 9.0, None)
+    send(ledger, 1, now=9.5)
+    assert not ledger.observe([5.0], None, 3)
+    assert ledger.observe([6.0], 9.2, None) and ledger.age == 1
+
+
 def test_a_sensor_that_freezes_is_known_without_stamps_by_number_and_state():
     ledger = make()
     assert ledger.observe([1.0], None, 0) and ledger.observe([1.0], None, 0)  # a robot that stands
