@@ -55,8 +55,9 @@ from sb3_said.files.agents import restore_agent
 from sb3_said.files.archive import load_tree
 from sb3_said.files.atomic import write_json
 from sb3_said.files.checkpoint import CHECKPOINT_NAME
-from sb3_said.offline.belief import BeliefOnly, PlannerBelief, as_in_a_window
+from sb3_said.offline.belief import BeliefOnly, PlannerBelief
 from sb3_said.planner import InpaintingPlanner
+from sb3_said.planner.inpainting import newest
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.said.trial import WAYS
 
@@ -96,7 +97,7 @@ class Regression:
 
         :param action_history: (B, D, act_dim), oldest first
         """
-        since = as_in_a_window(action_history, delay)
+        since = newest(action_history, delay, self.max_delay)
         present, action = self.network(self.normalizer.normalize_states(state), since, delay)
         return self.normalizer.denormalize_states(present), action.clamp(-1.0, 1.0)
 

@@ -9,12 +9,12 @@ from typing import Any, Protocol
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from torch import nn
 from torch.nn import functional as F
 from tqdm.auto import tqdm
 
 from sb3_said.planner import InpaintingPlanner
-from sb3_said.planner.plain import OneStepModel
+from sb3_said.planner.inpainting import newest
+from sb3_said.planner.plain import OneStepModel, ZScored
 from sb3_said.planner.yardstick import RegressionYardstick
 from sb3_said.replay.windows import Windows, WindowSource
 
@@ -54,27 +54,21 @@ class PlannerBelief:
         return self.planner.plan(state, action_history, delay, n_candidates=1, temperature=0.0).present
 
 
-class LearnedBelief(nn.Module):
-    """A network that is trained on windows; states are z-scored by :meth:`fit_scale`.
+class LearnedBelief(ZScored):
+    """A network that is trained on windows and reads z-scored states.
 
     :param max_delay: D, the largest delay
     """
 
     learning_rate = 1e-3  # of Adam
-    mean: th.Tensor
-    std: th.Tensor
 
     def __init__(self, obs_dim: int, max_delay: int):
-        super().__init__()
+        super().__init__(obs_dim)
         self.max_delay = max_delay
-        self.register_buffer("mean", th.zeros(obs_dim))
-        self.register_buffer("std", th.ones(obs_dim))
 
     def fit_scale(self, source: WindowSource) -> None:
         """Take over how states are spread."""
-        std, mean = th.std_mean(source.start_states().to(self.mean.device), dim=0)
-        self.mean.copy_(mean)
-        self.std.copy_(th.where(std > 1e-6, std, 1.0))
+        self.scale_to(source.start_states().to(self.mean.device))
 
     def loss(self, windows: Windows, generator: th.Generator) -> th.Tensor:
         """Return the mean squared error of z-scored states.
@@ -83,9 +77,6 @@ class LearnedBelief(nn.Module):
         :param generator: of what is drawn beside them
         """
         raise NotImplementedError
-
-    def _z(self, states: th.Tensor) -> th.Tensor:
-        return (states - self.mean) / self.std
 
 
 class RolledOutModel(LearnedBelief):
@@ -117,19 +108,6 @@ class RolledOutModel(LearnedBelief):
         return self.model.loss(self._z(windows.states[:, :2]), windows.actions[:, 0], windows.valid[:, 1])
 
 
-def as_in_a_window(action_history: th.Tensor, delay: th.Tensor) -> th.Tensor:
-    """Return the actions since an observation as a window has them, a_{t-d} first: (B, D, act_dim).
-
-    What follows the d newest has no meaning; a :class:`RegressionYardstick` looks away from it.
-
-    :param action_history: (B, D, act_dim), oldest first
-    :param delay: (B,) int64 d
-    """
-    max_delay = action_history.shape[1]
-    rows = th.arange(max_delay, device=delay.device) + max_delay - delay[:, None]  # (B, D)
-    return action_history.gather(1, rows.clamp(max=max_delay - 1)[..., None].expand_as(action_history))
-
-
 class RegressedPresent(LearnedBelief):
     """A plain regression from the old state and the actions since to the present.
 
@@ -142,7 +120,8 @@ class RegressedPresent(LearnedBelief):
 
     def present(self, state: th.Tensor, action_history: th.Tensor, delay: th.Tensor) -> th.Tensor:
         """Ask the network once: (B, obs_dim)."""
-        return self.net(self._z(state), as_in_a_window(action_history, delay), delay)[0] * self.std + self.mean
+        since = newest(action_history, delay, self.max_delay)
+        return self.net(self._z(state), since, delay)[0] * self.std + self.mean
 
     def loss(self, windows: Windows, generator: th.Generator) -> th.Tensor:
         """Return the error at random ages."""

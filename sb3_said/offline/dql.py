@@ -19,7 +19,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_said.offline.learning import OfflineAlgorithm
-from sb3_said.sac.policies import DelayedSACPolicy, rows_of, seed_of, settings_of
+from sb3_said.sac.policies import DelayedSACPolicy, each_part, rows_of, seed_of, settings_of
 
 
 @dataclass(frozen=True)
@@ -202,20 +202,13 @@ class DQLPolicy(DelayedSACPolicy):
         actions = self.actor.sample(observation, n, generator)  # (B * n, act_dim)
         if n == 1:
             return actions
-        repeated = repeat(observation, n)
+        repeated = each_part(lambda x: x.repeat_interleave(n, 0), observation)
         values = th.cat(self.critic_target(repeated, actions), dim=1).amin(1).view(-1, n)  # (B, n)
         drawn = th.multinomial(values.softmax(1).cpu(), 1, generator=generator).to(actions.device)  # (B, 1)
         return actions.view(*values.shape, -1)[th.arange(len(drawn), device=actions.device), drawn[:, 0]]
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), "diffusion_kwargs": asdict(self.config)}
-
-
-def repeat(observation: PyTorchObs, n: int) -> PyTorchObs:
-    """Repeat each observation of a batch n times in a row."""
-    if isinstance(observation, dict):
-        return {key: value.repeat_interleave(n, 0) for key, value in observation.items()}
-    return observation.repeat_interleave(n, 0)
 
 
 class DQL(OfflineAlgorithm):

@@ -16,6 +16,7 @@ from torch.nn import functional as F
 
 from sb3_said.offline.datasets import Dataset
 from sb3_said.planner.checks import check_same
+from sb3_said.planner.plain import ZScored
 
 
 class Transitions(NamedTuple):
@@ -58,7 +59,7 @@ class IQLConfig:
                 raise ValueError(f"{name} is {value!r}, expected {expected}.")
 
 
-class ImplicitValues(nn.Module):
+class ImplicitValues(ZScored):
     """V(s), and the Q(s, a) it is learned from, without asking about an action that is not in the data.
 
     V is the expectile of Q over the data's actions: with tau near 1, that of the best of them. Inputs are z-scored and
@@ -70,17 +71,13 @@ class ImplicitValues(nn.Module):
     """
 
     def __init__(self, obs_dim: int, act_dim: int, config: IQLConfig | None = None):
-        super().__init__()
+        super().__init__(obs_dim)
         self.config = config = config or IQLConfig()
         self.v = _network(obs_dim, config.hidden)
         self.q = nn.ModuleList(_network(obs_dim + act_dim, config.hidden) for _ in range(2))
         self.q_target = copy.deepcopy(self.q).requires_grad_(False)
-        self.register_buffer("mean", th.zeros(obs_dim))
-        self.register_buffer("std", th.ones(obs_dim))
         self.register_buffer("scale", th.ones(()))
 
-    mean: th.Tensor
-    std: th.Tensor
     scale: th.Tensor
 
     @th.no_grad()
@@ -92,9 +89,7 @@ class ImplicitValues(nn.Module):
         :param longest: T, steps of the longest trajectory. Rewards are multiplied by T / (largest - smallest return),
             which is IQL's 1000 / (...) on MuJoCo
         """
-        std, mean = th.std_mean(states, dim=0)
-        self.mean.copy_(mean)
-        self.std.copy_(th.where(std > 1e-6, std, 1.0))
+        self.scale_to(states)
         spread = returns.max() - returns.min()
         self.scale.copy_(longest / spread if spread > 0 else th.ones(()))
 
@@ -126,9 +121,6 @@ class ImplicitValues(nn.Module):
         y = batch.rewards * self.scale + gamma * (1.0 - batch.terminated) * next_v  # (B,)
         q_loss = sum((F.mse_loss(q(x)[:, 0], y) for q in self.q), start=y.new_zeros(()))
         return {"v_loss": v_loss, "q_loss": q_loss}
-
-    def _z(self, states: th.Tensor) -> th.Tensor:
-        return (states - self.mean) / self.std
 
 
 class IQL:

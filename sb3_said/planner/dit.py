@@ -97,11 +97,11 @@ class DiT1d(nn.Module):
         act_dim: int,
         max_delay: int,
         length: int,
-        d_model: int = 256,
-        depth: int = 2,
-        embed_known: bool = True,
-        extra_states: bool = False,
-        first_guess: bool = False,
+        d_model: int,
+        depth: int,
+        embed_known: bool,
+        extra_states: bool,
+        first_guess: bool,
     ) -> None:
         super().__init__()
         self.d_model = d_model
@@ -150,14 +150,15 @@ class DiT1d(nn.Module):
 
         :param window: (B, L, obs_dim + act_dim), normalised, L at most ``length``; only known entries are read
         :param known: (B, L, obs_dim + act_dim) bool known mask
-        :param guess: (B, L, 2 * obs_dim + act_dim), needed where the network was made to be shown one
+        :param guess: (B, L, obs_dim + act_dim), needed where the network was made to be shown one
         """
         # (B, L, 2): whether the state is known, and the action
         flags = th.stack((known[..., 0], known[..., self.obs_dim]), dim=-1).to(window.dtype)
         added = self.flag_embedding(flags) + self.positions[: window.shape[1]]
         if self.guess_embedding is not None:
             assert guess is not None
-            added = added + self.guess_embedding(guess)
+            states = guess[..., : self.obs_dim]  # shown as moves since the first, too, which differ by little
+            added = added + self.guess_embedding(th.cat([guess, states - states[:, :1]], dim=-1))
         if self.known_embedding is None:
             return added
         # Zeros stand for the steps that a window of a smaller delay does not have

@@ -22,7 +22,7 @@ def known_mask(
     steps = th.arange(length, device=delay.device)
     known_states = (steps == 0).expand(len(delay), -1)  # (B, L)
     if state_known is not None:
-        known_states = th.cat([known_states[:, :1], _newest(state_known[..., None], delay, length - 1)[..., 0]], dim=1)
+        known_states = th.cat([known_states[:, :1], newest(state_known[..., None], delay, length - 1)[..., 0]], dim=1)
     known_actions = steps < delay[:, None]  # (B, L)
     return th.cat(
         [known_states[..., None].expand(-1, -1, obs_dim), known_actions[..., None].expand(-1, -1, act_dim)], dim=-1
@@ -50,11 +50,11 @@ def known_window(
     if state_history is None:
         states = F.pad(observation[:, None], (0, 0, 0, length - 1))  # (B, L, obs_dim)
     else:
-        states = th.cat([observation[:, None], _newest(state_history, delay, length - 1)], dim=1)
-    return th.cat([states, _newest(action_history, delay, length)], dim=-1)
+        states = th.cat([observation[:, None], newest(state_history, delay, length - 1)], dim=1)
+    return th.cat([states, newest(action_history, delay, length)], dim=-1)
 
 
-def _newest(history: th.Tensor, delay: th.Tensor, length: int) -> th.Tensor:
+def newest(history: th.Tensor, delay: th.Tensor, length: int) -> th.Tensor:
     """Return the d newest rows of a history, and zeros behind them: (B, length, n).
 
     :param history: (B, D, n), oldest first

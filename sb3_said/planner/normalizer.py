@@ -33,8 +33,8 @@ class Normalizer(nn.Module):
         obs_dim: int,
         act_dim: int,
         window_length: int,
-        action_transform: str = "standard",
-        relative_states: bool = False,
+        action_transform: str,
+        relative_states: bool,
     ) -> None:
         super().__init__()
         self.sizes = [obs_dim, act_dim]

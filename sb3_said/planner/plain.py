@@ -16,6 +16,28 @@ def plain_network(n_in: int, n_out: int, hidden: int) -> nn.Sequential:
     )
 
 
+class ZScored(nn.Module):
+    """A network that reads z-scores of n entries; before :meth:`scale_to` it reads them as they are."""
+
+    mean: th.Tensor
+    std: th.Tensor
+
+    def __init__(self, n: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", th.zeros(n))
+        self.register_buffer("std", th.ones(n))
+
+    @th.no_grad()
+    def scale_to(self, rows: th.Tensor) -> None:
+        """Take over how rows (M, n) are spread; an entry that never varies keeps its scale."""
+        std, mean = th.std_mean(rows, dim=0, correction=0)
+        self.mean.copy_(mean)
+        self.std.copy_(th.where(std > 1e-6, std, 1.0))
+
+    def _z(self, rows: th.Tensor) -> th.Tensor:
+        return (rows - self.mean) / self.std
+
+
 class ResidualBlock(nn.Module):
     """Two layers whose answer is added to what they read, normalised before (as in transformers, and in SimbaV1)."""
 

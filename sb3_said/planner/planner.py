@@ -65,11 +65,11 @@ class InpaintingPlanner(nn.Module):
             act_dim,
             max_delay,
             self.window_length,
-            config.d_model,
-            config.depth,
-            config.embed_known,
-            config.extra_state_probability > 0,
-            config.first_guess == "prior",
+            d_model=config.d_model,
+            depth=config.depth,
+            embed_known=config.embed_known,
+            extra_states=config.extra_state_probability > 0,
+            first_guess=config.first_guess == "prior",
         )
         self.first_guess = self.prior = None
         if config.first_guess == "prior":
@@ -426,23 +426,19 @@ class InpaintingPlanner(nn.Module):
         states, actions = given.split(self.sizes, dim=-1)
         guess = self._guess(states, actions, delay, known)
         assert guess is not None  # for mypy: the callers have seen to it
-        z, actions, _ = guess.split([*self.sizes, self.obs_dim], dim=-1)
+        z, actions = guess.split(self.sizes, dim=-1)
         return th.where(known[..., :1], states, self.normalizer.denormalize_states(z)), actions
 
     def _guess(self, states: th.Tensor, actions: th.Tensor, delay: th.Tensor, known: th.Tensor) -> th.Tensor | None:
-        """Return what the network is shown of the first guess: (B, L, 2 * obs_dim + act_dim), z-scored, or None.
-
-        States both as they are and as moves since the first, which differ by little.
-        """
+        """Return the first guess: (B, L, obs_dim + act_dim), states z-scored, actions as they are; None without one."""
         if self.first_guess is None:
             return None
         z = self.normalizer.normalize_states(states)
-        guess = self.first_guess(z, actions, delay, known[..., 0], longest=z.shape[1] - self.config.horizon)
-        return th.cat([guess, guess[..., : self.obs_dim] - z[:, :1]], dim=-1)
+        return self.first_guess(z, actions, delay, known[..., 0], longest=z.shape[1] - self.config.horizon)
 
     def _in_units(self, guess: th.Tensor) -> th.Tensor:
         """Return what :meth:`_guess` returns as a window in the planner's units: (B, L, obs_dim + act_dim)."""
-        z, actions, _ = guess.split([*self.sizes, self.obs_dim], dim=-1)
+        z, actions = guess.split(self.sizes, dim=-1)
         return self.normalizer.normalize(self.normalizer.denormalize_states(z), actions)
 
     def _expect(self, guess: th.Tensor | None, delay: th.Tensor) -> tuple[th.Tensor, th.Tensor] | None:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -220,17 +221,18 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         }
 
 
+def each_part(change: Callable[[th.Tensor], th.Tensor], observation: PyTorchObs) -> PyTorchObs:
+    """Change an observation, or each part of one that is a dict."""
+    if isinstance(observation, dict):
+        return {key: change(part) for key, part in observation.items()}
+    return change(observation)
+
+
 def rows_of(observation: PyTorchObs) -> Iterator[PyTorchObs]:
     """Yield each row of a batch as a batch of one."""
-    if not isinstance(observation, dict):
-        yield from observation.split(1)
-        return
-    n = len(observation["delay"])
-    if n == 1:
-        yield observation
-        return
+    n = len(observation["delay"] if isinstance(observation, dict) else observation)
     for i in range(n):
-        yield {key: value[i : i + 1] for key, value in observation.items()}
+        yield each_part(itemgetter(slice(i, i + 1)), observation)
 
 
 def seed_of(row: PyTorchObs) -> int:

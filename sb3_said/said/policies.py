@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from itertools import product
+from operator import itemgetter
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -19,7 +20,7 @@ from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner.graphs import EAGER_CALLS
 from sb3_said.planner.planner import Plan
 from sb3_said.planner.selection import choose
-from sb3_said.sac.policies import DelayedSACPolicy, rows_of, seed_of, settings_of
+from sb3_said.sac.policies import DelayedSACPolicy, each_part, rows_of, seed_of, settings_of
 from sb3_said.said.student import Student
 
 Answer = Literal["planner", "expert", "both", "student"]
@@ -277,12 +278,7 @@ class SAIDPolicy(DelayedSACPolicy):
         actions = th.empty(len(is_experts), self.planner.act_dim, device=self.device)
         for is_one in (True, False):
             if (of_one := is_experts == is_one).any():
-                part: PyTorchObs
-                if isinstance(observation, dict):
-                    part = {key: x[of_one] for key, x in observation.items()}
-                else:
-                    part = observation[of_one]
-                actions[of_one] = self._decide(part, is_one, deterministic)
+                actions[of_one] = self._decide(each_part(itemgetter(of_one), observation), is_one, deterministic)
         return actions
 
     def _decide(self, observation: PyTorchObs, is_experts: bool, deterministic: bool) -> th.Tensor:

@@ -14,6 +14,7 @@ from torch.nn import functional as F
 from tqdm.auto import tqdm
 
 from sb3_said.delays.space import KEYS, check_spaces
+from sb3_said.planner.plain import ZScored
 from sb3_said.sac.extractors import StateAugmentedExtractor
 from sb3_said.sac.policies import as_array
 
@@ -52,7 +53,7 @@ class Distillation:
             raise ValueError(f"Expected a learning_rate above 0 and a q_weight of at least 0: {self}")
 
 
-class Student(nn.Module):
+class Student(ZScored):
     """Reads [newest observation, actions since, age / D], z-scored, as the expert's actor does without the z-scores.
 
     :param observation_space: of the agent
@@ -61,22 +62,16 @@ class Student(nn.Module):
     :raises ValueError: for a width below 1
     """
 
-    mean: th.Tensor
-    std: th.Tensor
     preferred: th.Tensor
 
     def __init__(self, observation_space: spaces.Space[Any], action_space: spaces.Box, width: int):
-        super().__init__()
         if width < 1:
             raise ValueError(f"student_width is {width}, expected at least 1.")
-        state_space, self.max_delay = check_spaces(observation_space, action_space)
-        self.width, self.reader = width, None
-        n_inputs, act_dim = state_space.shape[0], action_space.shape[0]
-        if isinstance(observation_space, spaces.Dict):
-            self.reader = StateAugmentedExtractor(observation_space)
-            n_inputs = self.reader.features_dim
-        self.register_buffer("mean", th.zeros(n_inputs))
-        self.register_buffer("std", th.ones(n_inputs))
+        state_space, max_delay = check_spaces(observation_space, action_space)
+        reader = StateAugmentedExtractor(observation_space) if isinstance(observation_space, spaces.Dict) else None
+        n_inputs, act_dim = reader.features_dim if reader else state_space.shape[0], action_space.shape[0]
+        super().__init__(n_inputs)
+        self.width, self.max_delay, self.reader = width, max_delay, reader
         self.register_buffer("preferred", th.zeros(()))  # 1: it answers
         hidden = nn.Linear(n_inputs, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU()
         self.network = nn.Sequential(*hidden, nn.Linear(width, act_dim), nn.Tanh())
@@ -90,13 +85,10 @@ class Student(nn.Module):
 
     def answer(self, inputs: th.Tensor) -> th.Tensor:
         """Return actions in [-1, 1] for what it has read: (B, act_dim)."""
-        return self.network((inputs - self.mean) / self.std)
-
-    def forward(self, observation: PyTorchObs) -> th.Tensor:
-        return self.answer(self.read(observation))
+        return self.network(self._z(inputs))
 
     def react(self, observation: dict[str, np.ndarray]) -> np.ndarray:
-        """Answer one observation as :meth:`forward` does, in NumPy: (1, act_dim).
+        """Answer one observation as :meth:`answer` does, in NumPy: (1, act_dim).
 
         Sixteen calls of torch take five times as long as what they compute (results/student.md).
 
@@ -114,13 +106,6 @@ class Student(nn.Module):
         for layer in hidden:
             x = np.maximum(x @ as_array(layer.weight).T + as_array(layer.bias), 0.0)
         return np.tanh(x @ as_array(last.weight).T + as_array(last.bias))
-
-    @th.no_grad()
-    def fit(self, inputs: th.Tensor) -> None:
-        """Take over how its inputs (M, n_inputs) are spread."""
-        std, mean = th.std_mean(inputs, dim=0, correction=0)
-        self.mean.copy_(mean)
-        self.std.copy_(th.where(std > 1e-6, std, 1.0))
 
 
 @dataclass
@@ -156,7 +141,7 @@ def distill(model: SAID, config: Distillation, progress_bar: bool = False) -> fl
         rows = _visited(model, "planner", config.n_labels, generator)
     n_held_out = int(HELD_OUT * len(rows.inputs))
     held_out, rows = rows[:n_held_out], rows[n_held_out:]
-    student.fit(rows.inputs)
+    student.scale_to(rows.inputs)
     optimizer = th.optim.Adam(student.network.parameters(), lr=config.learning_rate)
     schedule = th.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, config.gradient_steps)
     rounds = config.rounds if model.env is not None and config.own_steps > 0 else 0

@@ -12,7 +12,8 @@ OBS, ACT, DELAY, LENGTH = 3, 2, 4, 10
 
 def make_network(randomised=True, **kwargs):
     th.manual_seed(0)
-    network = DiT1d(OBS, ACT, DELAY, LENGTH, d_model=64, **kwargs)
+    settings = {"depth": 2, "embed_known": True, "extra_states": False, "first_guess": False}
+    network = DiT1d(OBS, ACT, DELAY, LENGTH, d_model=64, **(settings | kwargs))
     if randomised:  # the initial zeros would hide everything
         for parameter in network.parameters():
             th.nn.init.normal_(parameter, std=0.1)
@@ -35,6 +36,15 @@ def test_nothing_is_computed_from_memory_that_was_never_written(monkeypatch):
     monkeypatch.setattr(th, "baddbmm", lambda out, a, b, beta, alpha: beta * out + alpha * th.bmm(a, b))
     monkeypatch.setattr(th.Tensor, "new_empty", lambda self, *size: self.new_full(size, math.nan))
     th.testing.assert_close(network(x, context, modulations), expected)
+
+
+def test_a_guess_is_shown_as_it_is_and_its_states_as_moves():
+    network, (x, known, _) = make_network(first_guess=True), make_inputs()
+    guess, nothing = th.randn_like(x), th.zeros_like(x)
+    moves = th.stack([guess[:, k, :OBS] - guess[:, 0, :OBS] for k in range(LENGTH)], dim=1)
+    weight = network.guess_embedding.weight  # (64, OBS + ACT + OBS)
+    added = network.context(x, known, guess) - network.context(x, known, nothing)
+    th.testing.assert_close(added, th.cat([guess, moves], dim=-1) @ weight.T, atol=1e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize("length", [2, 12, 24])

@@ -83,7 +83,7 @@ def test_a_fall_of_a_narrow_log_is_not_cut_off():
 
 def test_it_learns_a_linear_system_and_its_behaviour():
     source = make_source(process_noise=0.0)
-    normalizer = Normalizer(STATE_DIM, ACTION_DIM, L, relative_states=True)
+    normalizer = Normalizer(STATE_DIM, ACTION_DIM, L, "standard", relative_states=True)
     normalizer.fit(source.start_states(), source.start_actions())
     generator = th.Generator().manual_seed(0)
     windows = source.sample(2_000, L, generator)
@@ -108,7 +108,7 @@ def test_the_clone_does_what_weighs_more_and_moves_are_the_data_s():
     is_good = source.envs % 2 == 0
     actions = th.where(th.arange(40) % 2 == 0, 0.8, -0.8)[None, :, None].expand_as(source.actions).clone()
     source = replace(source, actions=actions, values=is_good.float())
-    normalizer = Normalizer(STATE_DIM, ACTION_DIM, L, relative_states=True)
+    normalizer = Normalizer(STATE_DIM, ACTION_DIM, L, "standard", relative_states=True)
     normalizer.fit(source.start_states(), source.start_actions())
     normalizer.fit_moves(source.sample(1_000, L, generator))
     guess = make_guess()
@@ -128,7 +128,7 @@ def test_older_steps_teach_the_model_and_not_the_clone():
     for t in range(1, len(states)):
         states[t] = next_state(states[t - 1], actions[t - 1])
     older = replace(older, states=states, actions=actions)
-    normalizer = Normalizer(STATE_DIM, ACTION_DIM, L, relative_states=True)
+    normalizer = Normalizer(STATE_DIM, ACTION_DIM, L, "standard", relative_states=True)
     normalizer.fit(older.start_states(), older.start_actions())
     errors, clones = {}, {}
     for name, given_older in (("newest alone", None), ("both", older)):

@@ -12,7 +12,7 @@ from sb3_said.replay.windows import Windows
 
 @pytest.mark.parametrize("transform", ["standard", "tanh"])
 def test_normalised_data_has_mean_0_and_deviation_1(transform):
-    normalizer = Normalizer(3, 1, 4, transform)
+    normalizer = Normalizer(3, 1, 4, transform, relative_states=False)
     states = th.randn(1000, 3, generator=seeded()) * th.tensor([3.0, 1e-7, 0.0]) + th.tensor([50.0, 0.0, 1.2345])
     actions = (2 * th.randn(1000, 1, generator=seeded(1))).tanh()
     normalizer.fit(states, actions)
@@ -28,7 +28,7 @@ def test_normalised_data_has_mean_0_and_deviation_1(transform):
 @pytest.mark.parametrize("transform", ["standard", "tanh"])
 @given(action=st.floats(-1, 1), prediction=st.floats(-1e3, 1e3), mean=st.floats(-1, 1), std=st.floats(0.1, 3))
 def test_actions_return_from_the_transform_within_bounds(transform, action, prediction, mean, std):
-    normalizer = Normalizer(1, 1, 4, transform)
+    normalizer = Normalizer(1, 1, 4, transform, relative_states=False)
     normalizer.action_mean.fill_(mean)
     normalizer.action_std.fill_(std)
     action = th.tensor([action])

@@ -93,12 +93,11 @@ def naive_network(net, x, context, t):
 
 
 def naive_guess(planner, observation, history, d):
-    """What the network is shown of the plain networks' window, step after step: (d + horizon, 2 * OBS + ACT)."""
-    rows, first = [], planner.normalizer.normalize_states(observation)
-    state = first
+    """What the network is shown of the plain networks' window, step after step: (d + horizon, OBS + ACT)."""
+    rows, state = [], planner.normalizer.normalize_states(observation)
     for k in range(d + planner.config.horizon):
         action = planner.first_guess.clone(state).clamp(-1, 1) if k >= d else th.zeros(ACT)
-        rows.append(th.cat([state, action, state - first]))
+        rows.append(th.cat([state, action]))
         if k < d:
             state = planner.first_guess.model(state, history[DELAY - d + k]).clamp(-FARTHEST, FARTHEST)
     return th.stack(rows)

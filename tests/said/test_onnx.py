@@ -33,7 +33,7 @@ def test_it_answers_as_the_agent(max_delay, tmp_path):
     if max_delay:  # what is older than an observation is not to be read
         obs["delay"][:, 0], obs["action_history"] = np.arange(7) % 3, rng.uniform(-1, 1, (7, 2, 1)).astype(np.float32)
         assert (obs["action_history"][obs["delay"][:, 0] == 0] != 0).all()
-    student.fit(student.read(model.policy.obs_to_tensor(obs)[0]))
+    student.scale_to(student.read(model.policy.obs_to_tensor(obs)[0]))
     for layer in student.network[::2]:
         layer.weight.data *= 2
     export(model.policy, tmp_path / "agent.onnx")

@@ -57,7 +57,8 @@ def test_it_answers_as_the_planner_and_an_untaught_one_does_not(taught):
         found = answer(taught, obs)
         np.testing.assert_array_equal(answer(taught, {key: value[3] for key, value in obs.items()}), found[3])
         np.testing.assert_array_equal(taught.predict_plan(obs, deterministic=True)[:, 0], found)
-    untaught = Student(taught.observation_space, taught.action_space, 32)(taught.policy.obs_to_tensor(obs)[0])
+    other = Student(taught.observation_space, taught.action_space, 32)
+    untaught = other.answer(other.read(taught.policy.obs_to_tensor(obs)[0]))
     error, spread = np.abs(found - wanted).max(), np.abs(wanted - wanted.mean(0)).max()
     assert spread > 0.2 and error < 0.15 * spread < np.abs(2 * untaught.detach().numpy() - wanted).max()
     assert 0 < taught.error < 0.15
@@ -78,14 +79,16 @@ def test_it_reacts_in_numpy_as_it_learned_in_torch(seed: int, max_delay: int, is
         history = 2 * th.rand(1, max_delay, act_dim, generator=generator) - 1
         age = th.randint(max_delay + 1, (1, 1), generator=generator).float()
         obs = {"observation": obs, "action_history": history, "delay": age}
-    student.fit(student.read(obs) + th.randn(9, 1, generator=generator))
+    student.scale_to(student.read(obs) + th.randn(9, 1, generator=generator))
     arrays = {key: x.numpy() for key, x in (obs if isinstance(obs, dict) else {"observation": obs}).items()}
-    th.testing.assert_close(th.from_numpy(student.react(arrays)), student(obs), atol=1e-6, rtol=1e-5)
+    th.testing.assert_close(
+        th.from_numpy(student.react(arrays)), student.answer(student.read(obs)), atol=1e-6, rtol=1e-5
+    )
 
 
 def test_what_never_changes_is_read_as_it_is():
     student = Student(Drift.observation_space, Drift.action_space, 8)
-    student.fit(th.tensor([[3.0, -1.0], [3.0, 1.0]]))
+    student.scale_to(th.tensor([[3.0, -1.0], [3.0, 1.0]]))
     assert student.std.tolist() == [1.0, 1.0] and student.mean.tolist() == [3.0, 0.0]
 
 
