@@ -103,7 +103,7 @@ class GuessAlone:
     def predict(self, observation: Any, state: Any = None, **_: Any) -> tuple[np.ndarray, Any]:
         parts = {key: th.as_tensor(observation[key], device=self.said.device) for key in KEYS}
         planner = self.said.policy.planner
-        action = planner.guess(parts[KEYS[0]], parts[KEYS[1]], parts[KEYS[2]][:, 0].long())[1]
+        action = planner.guess(parts["observation"], parts["action_history"], parts["delay"][:, 0].long())[1]
         return self.said.policy.unscale_action(action.cpu().numpy()), state
 
 

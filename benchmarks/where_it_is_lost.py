@@ -57,7 +57,7 @@ class ShowPresents(gym.Wrapper[Any, Any, Any, Any]):
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(**kwargs)
-        self.states = [info[UNDELAYED]] * (len(observation[KEYS[1]]) + 1)
+        self.states = [info[UNDELAYED]] * (len(observation["action_history"]) + 1)
         return self._add(observation), info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -156,7 +156,7 @@ class Held(Player):
     def predict(
         self, observation: dict[str, np.ndarray], state: Any = None, episode_start: Any = None, **_: Any
     ) -> tuple[np.ndarray, Any]:
-        if len(self.left[0]) != len(observation[KEYS[0]]):  # an episode has ended
+        if len(self.left[0]) != len(observation["observation"]):  # an episode has ended
             self.left = [th.empty(0)]
         return super().predict(observation, state)
 

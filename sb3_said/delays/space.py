@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -120,8 +120,19 @@ def delayed_space(
     return spaces.Dict(parts)
 
 
-def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> tuple[spaces.Box, int]:
-    """Return the space of true states and the largest delay D of a task.
+class TaskSpaces(NamedTuple):
+    """What a task is without its delay, and how large that can be."""
+
+    state: spaces.Box
+    """of true states, (obs_dim,)"""
+    action: spaces.Box
+    """(act_dim,)"""
+    max_delay: int
+    """D"""
+
+
+def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> TaskSpaces:
+    """Return the spaces of a task and its largest delay D.
 
     :param observation_space: a 1-D Box, or that of ``DelayedObservationWrapper``
     :param action_space: a 1-D Box with finite bounds
@@ -145,7 +156,7 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
     state_box, action_box = check_task(state_space, action_space)
     if isinstance(observation_space, spaces.Dict):
         _check_parts(observation_space, state_box, action_box, max_delay)
-    return state_box, max_delay
+    return TaskSpaces(state_box, action_box, max_delay)
 
 
 def _check_parts(space: spaces.Dict, state_box: spaces.Box, action_box: spaces.Box, max_delay: int) -> None:

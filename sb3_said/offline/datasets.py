@@ -85,7 +85,7 @@ class Dataset:
             state: (n + 1,) int. Ages are 0 by default, which is all that a planner and values need
         :param buffer_kwargs: of :class:`~sb3_said.replay.DelayedReplayBuffer`
         """
-        _, max_delay = check_spaces(observation_space, action_space)
+        max_delay = check_spaces(observation_space, action_space).max_delay
         size = max(len(self) + 1, max_delay + 2)  # a full buffer has lost its oldest past, and does not sample it
         buffer = DelayedReplayBuffer(size, observation_space, action_space, **buffer_kwargs)
         ends, lengths = np.flatnonzero(self.ends), self.lengths
@@ -139,8 +139,7 @@ def load_dataset(
         It names the file and the row
     :raises FileNotFoundError: where there is no such file
     """
-    state_space, _ = check_spaces(observation_space, action_space)
-    assert isinstance(action_space, spaces.Box)
+    state_space, action_space, _ = check_spaces(observation_space, action_space)
     read = []
     for part in source if isinstance(source, (list, tuple)) else [source]:
         log = _read(part, progress_bar)

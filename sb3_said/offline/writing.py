@@ -58,9 +58,8 @@ def write_dataset(
     :raises ValueError: as :func:`check_target`
     """
     check_target(target)
-    state_space, _ = check_spaces(env.observation_space, env.action_space)
-    assert isinstance(env.action_space, gym.spaces.Box)  # as check_spaces says
-    actions, spec = unscale_action(data.actions, env.action_space), env.unwrapped.spec
+    state_space, action_space, _ = check_spaces(env.observation_space, env.action_space)
+    actions, spec = unscale_action(data.actions, action_space), env.unwrapped.spec
     if is_file(target):
         columns = {
             "observations": data.states,

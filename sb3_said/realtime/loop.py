@@ -80,7 +80,7 @@ class ControlLoop:
         count_latency: bool = True,
         simulate: Callable[[float], int] | None = None,
     ):
-        state_space, max_delay = check_spaces(model.observation_space, model.action_space)
+        state_space, space, max_delay = check_spaces(model.observation_space, model.action_space)
         if normalize is None and getattr(model, "reads_normalized", False):
             raise ValueError(
                 "The model reads observations that VecNormalize has normalised: give normalize=venv.normalize_obs, or "
@@ -97,7 +97,7 @@ class ControlLoop:
             raise ValueError(
                 f"max_age is {max_age}, but the model reads ages 0..{max_delay}; train it with a larger max_delay."
             )
-        space, middle = model.action_space, unscale_action(np.zeros(model.action_space.shape), model.action_space)
+        middle = unscale_action(np.zeros(space.shape), space)
         safe = middle if safe_action is None else np.array(safe_action, space.dtype)
         if not space.contains(safe):
             raise ValueError(f"safe_action is {safe_action}, expected an action of {space}.")

@@ -67,7 +67,7 @@ class DelayedReplayBuffer(ReplayBuffer):
         self.handle_timeout_termination = handle_timeout_termination
         self.buffer_size = max(buffer_size // n_envs, 1)
         self.is_delayed = isinstance(observation_space, spaces.Dict)
-        state_space, self.max_delay = check_spaces(observation_space, action_space)
+        state_space, _, self.max_delay = check_spaces(observation_space, action_space)
         if self.buffer_size <= self.max_delay + 1:
             raise ValueError(
                 f"A buffer of {self.buffer_size} steps per environment cannot rebuild observations that are up to "

@@ -249,7 +249,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
                 f"This {type(self).__name__} was built for a task {'in' if is_delayed else 'without'} a "
                 f"DelayedObservationWrapper, got {env.observation_space}; {remedy if is_delayed else 'leave it out'}."
             )
-        own, given = self.policy.max_delay, check_spaces(env.observation_space, self.action_space)[1]
+        own, given = self.policy.max_delay, check_spaces(env.observation_space, self.action_space).max_delay
         if own != given:
             raise ValueError(
                 f"This {type(self).__name__} was built for max_delay={own}, but this environment has max_delay={given};"

@@ -56,7 +56,7 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         average_actor: bool = False,
         **policy_kwargs: Any,
     ):
-        state_space, self.max_delay = check_spaces(observation_space, action_space)
+        state_space, _, self.max_delay = check_spaces(observation_space, action_space)
         self.augment_state = augment_state
         self.delay_reconciled_critic = delay_reconciled_critic
         self.normalise_states = normalise_states
@@ -80,7 +80,7 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         self.return_scale = ReturnScale() if self.scale_rewards else None
         self.state_normalizer: StateNormalizer | None = None
         if self.normalise_states:
-            state_space, _ = check_spaces(self.observation_space, self.action_space)
+            state_space = check_spaces(self.observation_space, self.action_space).state
             self.state_normalizer = StateNormalizer(state_space.shape[0])
         super()._build(lr_schedule)
         self.averaged_actor: Actor | None = None

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 from torch import nn
 
 from sb3_said.delays.space import KEYS, check_spaces
@@ -34,11 +33,10 @@ def to_onnx(policy: SAIDPolicy) -> Any:
         from onnx import TensorProto, helper, numpy_helper
     except ImportError as error:
         raise ImportError('onnx is missing, which export needs: pip install "sb3_said[export]"') from error
-    student, space = policy.student, policy.action_space
+    student = policy.student
     if student is None:
         raise ValueError("This agent has no student to export; call distill() first, and save it.")
-    assert isinstance(space, spaces.Box)  # as check_spaces says
-    state_space, max_delay = check_spaces(policy.observation_space, space)
+    state_space, space, max_delay = check_spaces(policy.observation_space, policy.action_space)
     obs_dim, act_dim = state_space.shape[0], space.shape[0]
     nodes: list[Any] = []
     constants: list[Any] = []
@@ -53,14 +51,14 @@ def to_onnx(policy: SAIDPolicy) -> Any:
         nodes.append(helper.make_node(kind, list(inputs), [name], **attributes))
         return name
 
-    read = KEYS[0]
+    read = "observation"
     if student.reader is not None:
         steps_ago = constant(np.arange(max_delay, 0, -1))  # (D,)
-        since = add("Cast", [add("LessOrEqual", [steps_ago, KEYS[2]])], to=TensorProto.FLOAT)  # (B, D)
-        history = add("Mul", [KEYS[1], add("Unsqueeze", [since, constant([2], np.int64)])])
+        since = add("Cast", [add("LessOrEqual", [steps_ago, "delay"])], to=TensorProto.FLOAT)  # (B, D)
+        history = add("Mul", ["action_history", add("Unsqueeze", [since, constant([2], np.int64)])])
         flat = add("Flatten", [history], axis=1)  # also where D is 0, of which a Reshape could not tell B
-        age = add("Div", [KEYS[2], constant(max(max_delay, 1))])
-        read = add("Concat", [KEYS[0], flat, age], axis=1)
+        age = add("Div", ["delay", constant(max(max_delay, 1))])
+        read = add("Concat", ["observation", flat, age], axis=1)
     x = add("Div", [add("Sub", [read, constant(student.mean.cpu())]), constant(student.std.cpu())])
     for layer in student.network:
         if isinstance(layer, nn.Linear):

@@ -21,7 +21,7 @@ from sb3_said.planner.graphs import EAGER_CALLS
 from sb3_said.planner.planner import Plan
 from sb3_said.planner.selection import choose
 from sb3_said.sac.policies import DelayedSACPolicy, each_part, rows_of, seed_of, settings_of
-from sb3_said.said.student import Student
+from sb3_said.said.student import Student, as_delayed
 
 Answer = Literal["planner", "expert", "both", "student"]
 Value = Literal["critics", "iql"]
@@ -85,10 +85,9 @@ class SAIDPolicy(DelayedSACPolicy):
 
     def make_planner(self, config: PlannerConfig) -> None:
         """Take a new, untrained planner of these settings."""
-        state_space, max_delay = check_spaces(self.observation_space, self.action_space)
-        obs_dim, act_dim = state_space.shape[0], self.action_space.shape[0]  # type: ignore[index]  # a Box has a shape
-        config = self._scored(config)
-        self.planner = InpaintingPlanner(obs_dim, act_dim, max_delay, config).to(self.device).requires_grad_(False)
+        state_space, action_space, max_delay = check_spaces(self.observation_space, self.action_space)
+        sizes = state_space.shape[0], action_space.shape[0], max_delay
+        self.planner = InpaintingPlanner(*sizes, self._scored(config)).to(self.device).requires_grad_(False)
         self.planner_updates.zero_()
         self.expert_preferred.zero_()
 
@@ -101,8 +100,7 @@ class SAIDPolicy(DelayedSACPolicy):
             raise ValueError(f"value is {value!r}, expected one of {', '.join(get_args(Value))}.")
         self.values = None
         if value == "iql":
-            state_space, _ = check_spaces(self.observation_space, self.action_space)
-            sizes = state_space.shape[0], self.action_space.shape[0]  # type: ignore[index]  # a Box has a shape
+            sizes = self.planner.obs_dim, self.planner.act_dim
             self.values = ImplicitValues(*sizes, self.iql_config).to(self.device)
             self.planner.config = self._scored(self.planner.config)
 
@@ -113,7 +111,6 @@ class SAIDPolicy(DelayedSACPolicy):
 
     def make_student(self, width: int | None) -> None:
         """Take a new, untrained student, or none."""
-        assert isinstance(self.action_space, spaces.Box)  # as check_spaces says
         student = None if width is None else Student(self.observation_space, self.action_space, width).to(self.device)
         self.student: Student | None = student
 
@@ -294,7 +291,7 @@ class SAIDPolicy(DelayedSACPolicy):
         """
         if self.planner.config.decided_by == "actor":
             is_delayed = isinstance(self.observation_space, spaces.Dict)
-            seen = self._as_if_seen(observation) if is_delayed else observation[KEYS[0]]
+            seen = self._as_if_seen(observation) if is_delayed else observation["observation"]
             return super()._predict(seen, deterministic=True)
         state, history, delay = (observation[key] for key in KEYS)
         return self.planner.plan(state, history, delay[:, 0].long(), temperature=0.0).action
@@ -305,7 +302,7 @@ class SAIDPolicy(DelayedSACPolicy):
             return observation
         state, history, delay = (observation[key] for key in KEYS)
         present, _ = self.planner.guess(state, history, delay[:, 0].long())
-        return {**observation, KEYS[0]: present, KEYS[2]: th.zeros_like(delay)}
+        return {**observation, "observation": present, "delay": th.zeros_like(delay)}
 
     def _is_experts(self, observation: PyTorchObs, who: Answer) -> th.Tensor:
         """Tell for which observations the expert decides: (B,) bool.
@@ -314,13 +311,13 @@ class SAIDPolicy(DelayedSACPolicy):
         grows, and a planner that takes over from the expert amid its first steps falls (measured, results/agents.md).
         """
         if who == "both" and isinstance(observation, dict):
-            history, age = observation[KEYS[1]], observation[KEYS[2]][:, 0].long()  # (B, D, act_dim), (B,)
+            history, age = observation["action_history"], observation["delay"][:, 0].long()  # (B, D, act_dim), (B,)
             rows, steps = th.arange(len(age), device=age.device), (self.max_delay - 1 - age).clamp(min=0)
             led_there = history[rows, steps]  # a_{t-d-1}, zeros where s_{t-d} is s_0
             begins, ages = ~led_there.ne(0).any(1), self.expert_ages
             is_its_age = (age >= ages.start) & (age < ages.stop)
             return th.where(begins, self.max_delay in ages, is_its_age)
-        n = len(observation[KEYS[0]] if isinstance(observation, dict) else observation)
+        n = len(observation["observation"] if isinstance(observation, dict) else observation)
         return th.full((n,), who == "expert", device=self.device)
 
     @th.no_grad()
@@ -355,19 +352,14 @@ class SAIDPolicy(DelayedSACPolicy):
 
         :param repeats: let each row decide its noise
         """
-        extra: dict[str, Any] = {}
-        if isinstance(observation, dict):
-            extra = {key: observation[key] for key in STATE_KEYS if key in observation}
-            states, history, delay = (observation[key] for key in KEYS)
-            delay = delay[:, 0].long()
-        else:
-            states, history = observation, observation.new_zeros(len(observation), 0, self.planner.act_dim)
-            delay = th.zeros(len(observation), dtype=th.long, device=observation.device)
+        parts = as_delayed(observation, self.planner.act_dim)
+        extra: dict[str, Any] = {key: parts[key] for key in STATE_KEYS if key in parts}
+        states, history, delay = (parts[key] for key in KEYS)
         chooses = self.planner.config.temperature > 0  # else there is no noise and one candidate
         return self.planner.plan(
             states,
             history,
-            delay,
+            delay[:, 0].long(),
             value_fn=self.value if chooses else None,
             noise=th.stack([*map(self._noise_of, rows_of(observation))]) if chooses and repeats else None,
             **extra,

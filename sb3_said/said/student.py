@@ -64,12 +64,12 @@ class Student(ZScored):
 
     preferred: th.Tensor
 
-    def __init__(self, observation_space: spaces.Space[Any], action_space: spaces.Box, width: int):
+    def __init__(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], width: int):
         if width < 1:
             raise ValueError(f"student_width is {width}, expected at least 1.")
-        state_space, max_delay = check_spaces(observation_space, action_space)
+        state_space, action_box, max_delay = check_spaces(observation_space, action_space)
         reader = StateAugmentedExtractor(observation_space) if isinstance(observation_space, spaces.Dict) else None
-        n_inputs, act_dim = reader.features_dim if reader else state_space.shape[0], action_space.shape[0]
+        n_inputs, act_dim = reader.features_dim if reader else state_space.shape[0], action_box.shape[0]
         super().__init__(n_inputs)
         self.width, self.max_delay, self.reader = width, max_delay, reader
         self.register_buffer("preferred", th.zeros(()))  # 1: it answers
@@ -94,9 +94,9 @@ class Student(ZScored):
 
         :param observation: arrays (1, ...) by key, "observation" alone without delay
         """
-        x = observation[KEYS[0]]
+        x = observation["observation"]
         if self.reader is not None:
-            history, age = observation[KEYS[1]], observation[KEYS[2]]
+            history, age = observation["action_history"], observation["delay"]
             since = np.arange(self.max_delay, 0, -1) <= age  # (1, D)
             x = np.concatenate(
                 [x, (history * since[..., None]).reshape(1, -1), age / max(self.max_delay, 1)], axis=1, dtype=np.float32
@@ -206,14 +206,16 @@ def _visited(model: SAID, who: str, n_steps: int, generator: th.Generator) -> _R
         env.seed(int(th.randint(2**31, (), generator=generator)))
         obs: Any = env.reset()
         for _ in range(-(-n_steps // env.num_envs)):
-            given = model.policy.obs_to_tensor(obs)[0]
-            visited.append(given if isinstance(given, dict) else _undelayed(given, model.policy.planner.act_dim))
+            visited.append(as_delayed(model.policy.obs_to_tensor(obs)[0], model.policy.planner.act_dim))
             obs = env.step(model.predict(obs, deterministic=True)[0])[0]
     parts = {key: th.cat([each[key] for each in visited]) for key in KEYS}
     return _labelled(model, parts, th.full_like(parts["observation"], th.nan))
 
 
-def _undelayed(states: th.Tensor, act_dim: int) -> dict[str, th.Tensor]:
-    """Return observations of a task without delay as delayed ones of max_delay 0."""
-    n = len(states)
-    return {"observation": states, "action_history": states.new_zeros(n, 0, act_dim), "delay": states.new_zeros(n, 1)}
+def as_delayed(observation: PyTorchObs, act_dim: int) -> dict[str, th.Tensor]:
+    """Return observations as a delayed task has them; of one without delay, of age 0 and without a history."""
+    if isinstance(observation, dict):
+        return observation
+    n = len(observation)
+    history, delay = observation.new_zeros(n, 0, act_dim), observation.new_zeros(n, 1)
+    return {"observation": observation, "action_history": history, "delay": delay}

@@ -12,7 +12,6 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 from tqdm.auto import tqdm
 
-from sb3_said.delays.space import KEYS
 from sb3_said.planner.config import SAMPLING_SETTINGS, PlannerConfig
 from sb3_said.sac.policies import settings_of
 
@@ -35,8 +34,8 @@ class Trial:
     """What :func:`play_trial` measured."""
 
     returns: dict[str, np.ndarray]
-    """of "planner", those of ``planner_ways`` that differ from it, and "expert", (n_episodes,), undiscounted, in the
-    task's own rewards"""
+    """(n_episodes,) of each of ``planner_ways``, in their order; of "planner", in the place of the way that is its own
+    or behind them; and of "expert". Undiscounted, in the task's own rewards"""
     ages: np.ndarray
     """(n_episodes,) age of the observations of each, amid the episode, in control steps; 0 for all where it changes
     within episodes, which then differ in it from player to player"""
@@ -71,7 +70,9 @@ def ways_of(
 
 
 def in_way(own: PlannerConfig, settings: dict[str, Any]) -> PlannerConfig:
-    """Return a planner's settings in a way to decide; who decides, and where, gives way to what that says of the other.
+    """Return a planner's settings changed to a way to decide.
+
+    Where ``decided_by`` and ``present`` contradict each other, the way's own stands, and the other is the default's.
 
     :raises ValueError: for values outside their range, or that this planner cannot have
     """
@@ -115,14 +116,14 @@ def play_trial(
     :raises KeyboardInterrupt: when ``should_stop`` has ended the trial
     """
     seed, own = int(np.random.randint(2**31)), model.policy.planner.config
-    ways = _configs(model)
+    named = {"planner" if way == own else name: way for name, way in _configs(model).items()} | {"planner": own}
     can_act = model._n_updates > 0 and 0 in (model.trained_ages or [])
     can_act &= model.policy.max_delay > 0  # without delay the actor is the expert
-    others = {name: way for name, way in ways.items() if way != own and (way.decided_by == "plan" or can_act)}
+    ways = {name: way for name, way in named.items() if name == "planner" or way.decided_by == "plan" or can_act}
     returns, ages, n_steps = {}, {}, 0
     try:
         with model.borrowed_env() as env:
-            for name, config in {"planner": own, **others, "expert": own}.items():
+            for name, config in {**ways, "expert": own}.items():
                 model.policy.planner.config = config
                 env.seed(seed)
                 who = "expert" if name == "expert" else "planner"
@@ -145,14 +146,12 @@ def _play(
     """
     ages: list[list[float]] = [[] for _ in range(env.num_envs)]
     ended: list[tuple[int, float]] = []  # environment and age of each episode
-    n_steps, last = 0, None
+    n_calls = np.zeros(env.num_envs, int)  # of each environment, one a step while it has an episode to play
 
     def on_step(played: dict[str, Any], _: dict[str, Any]) -> None:
-        nonlocal n_steps, last
         i, observation = played["i"], played["observations"]
-        if played["rewards"] is not last:  # called for each environment that has an episode to play
-            n_steps, last = n_steps + env.num_envs, played["rewards"]
-        ages[i].append(float(observation[KEYS[2]][i, 0]) if isinstance(observation, dict) else 0.0)
+        n_calls[i] += 1
+        ages[i].append(float(observation["delay"][i, 0]) if isinstance(observation, dict) else 0.0)
         if played["done"]:
             settled = ages[i][model.policy.max_delay :] or ages[i][-1:]  # before, the episode is young
             ended.append((i, settled[0] if len(set(settled)) == 1 else np.nan))
@@ -163,14 +162,14 @@ def _play(
 
     played: Any = evaluate_policy(model, env, n_episodes, callback=on_step, return_episode_rewards=True, warn=False)
     order = np.argsort([i for i, _ in ended], kind="stable")
-    return np.asarray(played[0])[order], np.array([age for _, age in ended])[order], n_steps
+    return np.asarray(played[0])[order], np.array([age for _, age in ended])[order], env.num_envs * int(n_calls.max())
 
 
 def best_share(planner: np.ndarray, expert: np.ndarray, ages: np.ndarray) -> tuple[float, float, bool]:
-    """Return the best mean return that the two have together, the age that parts them, and whether the expert is below.
+    """Return the best mean return of the two together, the age that parts them, and whether the expert is below.
 
-    The age is -1 for the planner alone, and infinite for the expert alone; between two ages that were played it is
-    midway, and the one below answers at it, too.
+    The age is -1 for the planner alone, and infinite for the expert alone. Between two ages that were played it is
+    midway, and counts to the lower side.
 
     :param planner: (n,) returns of episodes
     :param expert: (n,) returns of the same episodes
@@ -200,8 +199,8 @@ def let_the_best_answer(
 ) -> dict[str, float]:
     """Let the planner in its best way answer, or the expert, or both, each at the ages at which it does better.
 
-    Of ways over which the best one gains no more than its error, the first of ``planner_ways`` is taken. Both answer
-    where that :func:`gains_more_than_its_error` over either alone. Warn where the expert alone does.
+    If the best way gains no more than its error over some, the first of these in ``planner_ways`` is taken. Both answer
+    only if that :func:`gains_more_than_its_error` over the better of the two. Warn where the expert alone answers.
 
     :return: mean returns, the expert's ages, and the number of steps played, for the log
     """
@@ -216,9 +215,7 @@ def let_the_best_answer(
     together = np.where((trial.ages <= cut) == is_below, expert, trial.returns[way])
     if not gains_more_than_its_error(together, trial.returns[alone]):
         best = trial.returns[max(ways, key=lambda name: trial.returns[name].mean())]
-        in_order = ["planner" if config == own else name for name, config in configs.items()]  # as it was played
-        in_order = [name for name in (*in_order, "planner") if name in ways]
-        way = next(name for name in in_order if not gains_more_than_its_error(best, trial.returns[name]))
+        way = next(name for name in ways if not gains_more_than_its_error(best, trial.returns[name]))
         cut, is_below = (np.inf if alone == "expert" else -1.0), True
     model.policy.planner.config = configs.get(way, own)
     if 0 <= cut < model.policy.max_delay:

@@ -11,7 +11,7 @@ from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import sync_envs_normalization
 
-from sb3_said import SAID
+from sb3_said import SAID, DelayedSAC
 from sb3_said.files.atomic import replacing
 from sb3_said.files.normalization import normalization_file, save_normalization
 from sb3_said.zoo.stopping import Stopping
@@ -62,7 +62,7 @@ def evaluate_answer(model: SAID, like: EvalCallback, folder: Path, stopping: Sto
         save_with_normalization(model, folder / BEST_NAME)
 
 
-def save_with_normalization(model: SAID, path: Path) -> None:
+def save_with_normalization(model: DelayedSAC, path: Path) -> None:
     """Write an agent, and beside it the normalisation that it reads its observations in."""
     model.save(path)
     vec_normalize = model.get_vec_normalize_env()

@@ -29,7 +29,7 @@ from sb3_said.files.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallbac
 from sb3_said.files.normalization import load_normalization, normalization_file, save_normalization
 from sb3_said.offline import BC, DQL, OfflineAlgorithm
 from sb3_said.offline.datasets import is_file
-from sb3_said.zoo.answer import BEST_NAME, EXPERT_FOLDER, evaluate_answer
+from sb3_said.zoo.answer import BEST_NAME, EXPERT_FOLDER, evaluate_answer, save_with_normalization
 from sb3_said.zoo.arguments import Delay, ending_training, largest_delay
 from sb3_said.zoo.folder import (
     claim_folder,
@@ -275,10 +275,10 @@ class DelayedExperimentManager(ExperimentManager):
         self.evaluation = next((c for c in self.callbacks if isinstance(c, EvalCallback)), None)
         self._set_evaluation()
         if self.evaluation is not None:
-            self.evaluation.callback_on_new_best = SaveNormalization(
-                normalization_file(Path(str(self.evaluation.best_model_save_path), BEST_NAME)),
-                self.evaluation.callback_on_new_best,
-            )
+            file = normalization_file(Path(str(self.evaluation.best_model_save_path), BEST_NAME))
+            own = self.evaluation.callback_on_new_best  # of rl_zoo3, for its own tools
+            assert own is not None
+            self.evaluation.callback_on_new_best = CallbackList([own, SaveNormalization(file)])
         self._add_checkpoints()
 
     def _set_evaluation(self) -> None:
@@ -357,12 +357,11 @@ class DelayedExperimentManager(ExperimentManager):
         model.task = self.env_name.gym_id  # which environments in other processes do not tell
         file = self.folder / f"{self.env_name}.zip"
         print(f"Saving to {self.save_path}")
-        model.save(file)
+        save_with_normalization(model, file)
         if self.save_replay_buffer:
             model.save_replay_buffer(self.folder / "replay_buffer.pkl")
         if (vec_normalize := model.get_vec_normalize_env()) is not None:
             vec_normalize.save(str(Path(self.params_path, "vecnormalize.pkl")))  # for rl_zoo3's own tools
-            save_normalization(normalization_file(file), vec_normalize)
 
     def _logger(self, steps: int) -> Logger:
         """Log to the screen, to progress.csv (one file per resume) and to TensorBoard if asked for.
@@ -382,20 +381,13 @@ class SaveNormalization(BaseCallback):
     """Write what VecNormalize has learned, beside the agent that reads it.
 
     :param path: of the file
-    :param before: rl_zoo3's own callback of the same purpose, for its own tools
     """
 
-    def __init__(self, path: Path, before: BaseCallback | None):
+    def __init__(self, path: Path):
         super().__init__()
-        self.path, self.before = path, before
-
-    def _init_callback(self) -> None:
-        if self.before is not None:
-            self.before.init_callback(self.model)
+        self.path = path
 
     def _on_step(self) -> bool:
-        if self.before is not None:
-            self.before.on_step()
         if (vec_normalize := self.model.get_vec_normalize_env()) is not None:
             save_normalization(self.path, vec_normalize)
         return True

@@ -163,9 +163,9 @@ def test_wrappers_around_ours_are_told_their_place(env, changed):
 
 def test_what_is_advised_instead_of_a_stack_of_frames_helps():
     env = DelayedObservationWrapper(FlattenObservation(FrameStackObservation(Drift(), 3)), 2)
-    assert check_spaces(env.observation_space, env.action_space)[0].shape == (6,)
+    assert check_spaces(env.observation_space, env.action_space).state.shape == (6,)
     normalized = VecNormalize(DummyVecEnv([delayed]), norm_obs_keys=["observation"])
-    assert check_spaces(normalized.observation_space, normalized.action_space)[1] == 2
+    assert check_spaces(normalized.observation_space, normalized.action_space).max_delay == 2
 
 
 def test_environments_of_one_batch_have_one_max_delay():
@@ -184,9 +184,9 @@ def test_a_delayed_task_tells_its_states_and_its_largest_delay(delay, max_delay,
     task = CountingTask(itertools.count(), max_length=3)
     env = DelayedObservationWrapper(task, delay, state_history=state_history)
     states = spaces.Box(-np.inf, np.inf, (OBS_DIM,), np.float32)
-    assert check_spaces(env.observation_space, env.action_space) == (states, max_delay)
+    assert check_spaces(env.observation_space, env.action_space) == (states, task.action_space, max_delay)
     assert has_state_history(env.observation_space) == state_history
-    assert check_spaces(task.observation_space, task.action_space) == (states, 0)
+    assert check_spaces(task.observation_space, task.action_space) == (states, task.action_space, 0)
     assert not has_state_history(task.observation_space)
 
 

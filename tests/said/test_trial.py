@@ -43,7 +43,7 @@ def test_returns_are_those_of_each_who_can_answer(trained):
     played = found.returns
     np.random.seed(3)
     seed = int(np.random.randint(2**31))
-    assert list(played) == ["planner", "weighed", "actor", "default", "one_step", "expert"]
+    assert list(played) == ["weighed", "actor", "default", "one_step", "planner", "expert"]
     assert found.n_steps == 6 * 3 * 15
     assert set(found.ages) <= {0, 1, 2}
     assert trained.policy.planner.config == before
@@ -101,7 +101,7 @@ def test_a_way_that_the_planner_already_has_is_not_played_twice_and_the_way_back
         returns = trial.play_trial(trained, n_episodes=1).returns
     finally:
         trained.policy.planner.config = own
-    assert list(returns) == ["planner", "weighed", "actor", "default", "expert"]
+    assert list(returns) == ["weighed", "actor", "default", "planner", "expert"]
 
 
 @pytest.mark.parametrize(("means", "answers"), [((1, 2, 3, 0), "planner"), ((3, 2, 1, 4), "expert")])
@@ -124,12 +124,12 @@ def test_of_ways_that_the_trial_cannot_tell_apart_the_first_is_taken(monkeypatch
     """The last is the best by less than the error of that over b, and by more than that over a."""
     base, gain = np.array([10.0, -7.0, 3.0, 3.0]), np.array([0.0, 2.0, 0.0, 2.0])  # error 0.577, as below
     played = {"planner": base - 9.0, "a": base - 0.6, "b": base + 0.5, "c": base + gain, "expert": base - 9.0}
-    monkeypatch.setattr(trial, "play_trial", lambda *_: trial.Trial(played, np.full(4, 2.0), 7))
-    ways = {name: {"n_candidates": n} for n, name in enumerate("abc", 5)}
-    chosen = [
-        make(planner_trial_episodes=2, planner_ways={name: ways[name] for name in order}).learn(60).planner_kwargs
-        for order in ("abc", "acb")
-    ]
+    ways, chosen = {name: {"n_candidates": n} for n, name in enumerate("abc", 5)}, []
+    for order in ("abc", "acb"):
+        returns = {name: played[name] for name in (*order, "planner", "expert")}  # as `play_trial` has them
+        monkeypatch.setattr(trial, "play_trial", lambda *_, given=returns: trial.Trial(given, np.full(4, 2.0), 7))
+        model = make(planner_trial_episodes=2, planner_ways={name: ways[name] for name in order})
+        chosen.append(model.learn(60).planner_kwargs)
     assert [settings["n_candidates"] for settings in chosen] == [6, 7]
 
 
