@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from measure import print_table, progress
+from measure import print_table, progress, resumed
 from what_diffusion_buys import agent_of, make_env, open_run, open_with_log
 
 from sb3_said import SAID
@@ -69,9 +69,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     model.set_planner(temperature=0.0)
     settings = {name: getattr(args, name) for name in ("settings", "delays", "episodes", "eval_seed")}
     settings |= agent_of(model, args)
-    document = json.loads(args.json.read_text()) if args.json.exists() else {"settings": settings, "rows": {}}
-    if (found := document.get("settings")) != settings:
-        p.error(f"{args.json} has rows of {found}, and these would be of {settings}; give another --json.")
+    document = resumed(p, args.json, settings, rows={})
     rows: dict[str, Any] = document["rows"]
     if "planner" not in rows:
         with model.policy.answering("planner"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import platform
 import sys
 import time
@@ -149,6 +150,20 @@ def write_json(path: Path | None, args: argparse.Namespace, rows: Sequence[Mappi
     settings = {key: value for key, value in vars(args).items() if key != "json"}
     result = {"date": date.today().isoformat(), "settings": settings, "machine": machine(args.device)}
     files.write_json(path, {**result, "rows": list(rows), **more}, default=_plain)
+
+
+def resumed(p: argparse.ArgumentParser, path: Path, settings: dict[str, Any], **empty: Any) -> dict[str, Any]:
+    """Return what a file of ``--json`` holds, or a document with nothing in it yet.
+
+    The program ends where the file has other settings.
+
+    :param p: tells the error
+    :param empty: parts of a new document
+    """
+    document: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {"settings": settings, **empty}
+    if (found := document.get("settings")) != settings:
+        p.error(f"{path} has rows of {found}, and these would be of {settings}; give another --json.")
+    return document
 
 
 def report(args: argparse.Namespace, rows: list[dict[str, Any]], **more: Any) -> list[dict[str, Any]]:

@@ -24,7 +24,6 @@ distances tell that the agent has left what the planner knows; large errors, tha
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable
 from functools import cached_property, partial
 from pathlib import Path
@@ -33,10 +32,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
-from measure import print_table, progress
+from measure import print_table, progress, resumed
 from motivation import OldObservation, load_agent
+from what_diffusion_buys import make_env
 
-from sb3_said import SAID, DelayedObservationWrapper
+from sb3_said import SAID
 from sb3_said.delays.space import KEYS, UNDELAYED
 from sb3_said.evaluation import confidence_interval, rollout
 from sb3_said.files.atomic import write_json
@@ -218,20 +218,14 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
         p.error(f"{args.run} is a {type(said).__name__}; give a SAID agent.")
     settings: dict[str, Any] = {"run": str(args.run), "trained_steps": said.num_timesteps}
     settings |= {name: getattr(args, name) for name in ("dataset", "actor", "episodes", "eval_seed", "seed")}
-    document: dict[str, Any] = {"settings": settings, "delays": {}}
-    if args.json.exists():
-        document = json.loads(args.json.read_text())
-        if (found := document.get("settings")) != settings:
-            p.error(f"{args.json} has rows of {found}, and these would be of {settings}; give another --json.")
+    document = resumed(p, args.json, settings, delays={})
     task = gym.make(said.task or "")
     data = load_dataset(args.dataset, task.observation_space, task.action_space, said.task, progress_bar=True)
     neighbours = Neighbours(data)
     actor = None if args.actor is None else load_agent(args.actor).model
 
-    def make_env(delay: int) -> gym.Env[Any, Any]:
-        return ShowPresents(
-            DelayedObservationWrapper(gym.make(said.task or ""), delay, max_delay=said.policy.max_delay)
-        )
+    def task_of(delay: int) -> gym.Env[Any, Any]:
+        return ShowPresents(make_env(said, delay))
 
     for delay in args.delays:
         rows = document["delays"].setdefault(str(delay), {})
@@ -239,7 +233,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
             if name not in rows:
                 th.manual_seed(args.seed)
                 progress(f"{name} plays {args.episodes} episodes at delay {delay}")
-                played = rollout(player, partial(make_env, delay), args.episodes, args.eval_seed, args.episodes)
+                played = rollout(player, partial(task_of, delay), args.episodes, args.eval_seed, args.episodes)
                 rows[name] = player.found(played.returns)
                 document["origin"] = origin(run)
                 write_json(args.json, document)

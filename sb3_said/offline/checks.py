@@ -13,7 +13,7 @@ from sb3_said.delays.space import scale_action
 
 ACTION_TOLERANCE = 1e-3  # of half the range: what float32 and a tanh leave beyond the bounds
 
-#: observations, actions, rewards, terminated, ends and next_observations of N rows; ``scaled`` for actions in [-1, 1]
+#: observations, actions, rewards, terminated, ends and next_observations of N rows
 Columns = dict[str, np.ndarray]
 
 
@@ -49,13 +49,13 @@ def flags(name: str, key: str, values: Any) -> np.ndarray:
     return column.astype(bool)
 
 
-def checked(name: str, columns: Columns, state_space: spaces.Box, action_space: spaces.Box) -> dict[str, np.ndarray]:
+def checked(name: str, columns: Columns, state_space: spaces.Box, box: spaces.Box) -> dict[str, np.ndarray]:
     """Return what a ``Dataset`` is made of, actions scaled.
 
     :param name: of the source, for errors
+    :param box: space of the actions as the log has them
     :raises ValueError: for what is no log of the task; it names the row
     """
-    box = spaces.Box(-1.0, 1.0, action_space.shape) if "scaled" in columns else action_space
     columns = {**columns, "rewards": _one_a_row(name, "rewards", columns["rewards"])}
     shapes = {"observations": state_space.shape, "actions": box.shape, "rewards": ()}
     floats = {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -147,7 +147,8 @@ def load_dataset(
         known = [(name, columns) for name, columns in log.parts if len(columns["rewards"])]
         if not known:
             raise ValueError(f"{log.name} has no step whose next state is known.")
-        read += [Dataset(**checked(name, columns, state_space, action_space)) for name, columns in known]
+        box = spaces.Box(-1.0, 1.0, action_space.shape) if log.is_scaled else action_space
+        read += [Dataset(**checked(name, columns, state_space, box)) for name, columns in known]
     if not read:
         raise ValueError("The list of datasets is empty; name at least one.")
     return _joined(read)
@@ -161,7 +162,7 @@ def is_file(source: Any) -> bool:
 def _read(source: Any, progress_bar: bool) -> Log:
     if isinstance(source, Dataset):
         name = type(source).__name__
-        return Log(name, None, [(name, _of_dataset(name, source))])
+        return Log(name, None, [(name, _of_dataset(name, source))], is_scaled=True)
     if isinstance(source, ReplayBuffer):
         return read_buffer(source)
     if is_file(source):
@@ -186,16 +187,13 @@ def _of_dataset(name: str, data: Dataset) -> Columns:
             f"{name} has finals of shape {finals.shape}, expected one for each end of a trajectory, {expected}, and "
             "the last step to be such an end."
         )
-    next_states = np.roll(states, -1, axis=0)
-    next_states[ends] = finals
     return {
         "observations": states,
         "actions": columns["actions"],
         "rewards": columns["rewards"],
         "terminated": flags(name, "terminated", columns["terminated"]),
         "ends": ends,
-        "next_observations": next_states,
-        "scaled": np.ones(len(ends), bool),
+        "next_observations": replace(data, states=states, ends=ends, finals=finals).next_states,
     }
 
 

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback, ProgressBarCallback
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, ProgressBarCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import configure_logger
 
@@ -122,11 +122,7 @@ class OfflineAlgorithm(DelayedSAC):
         if not self._custom_logger:
             name = tb_log_name or type(self).__name__
             self._logger = configure_logger(self.verbose, self.tensorboard_log, name, reset_num_timesteps)
-        if not progress_bar:
-            return self._init_callback(callback)
-        given = CallbackList(callback) if isinstance(callback, list) else callback
-        given = given if isinstance(given, BaseCallback) else ConvertCallback(given)
-        return self._init_callback([given, GradientStepBar()])
+        return self._init_callback([*listed(callback), *([GradientStepBar()] if progress_bar else [])])
 
     def _goes_on(self, watcher: BaseCallback) -> bool:
         """Call the callbacks after a gradient step; return whether learning goes on."""
@@ -179,3 +175,12 @@ class OfflineAlgorithm(DelayedSAC):
             return np.array([0, *(step() for _ in range(n_steps))])
 
         return draw
+
+
+def listed(callback: MaybeCallback | tuple[BaseCallback, ...]) -> list[BaseCallback]:
+    """Return callbacks, in any form that SB3 takes, as a list."""
+    if isinstance(callback, (list, tuple)):
+        return list(callback)
+    if callback is None or isinstance(callback, BaseCallback):
+        return [] if callback is None else [callback]
+    return [ConvertCallback(callback)]

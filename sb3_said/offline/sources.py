@@ -36,6 +36,8 @@ class Log(NamedTuple):
     """id of the task that it is of, where it says"""
     parts: list[tuple[str, Columns]]
     """each with its name, for errors"""
+    is_scaled: bool = False
+    """whether its actions are in [-1, 1], and not in the task's units"""
 
 
 def read_file(path: Path, progress_bar: bool) -> Log:
@@ -148,10 +150,9 @@ def read_buffer(buffer: ReplayBuffer) -> Log:
             "terminated": dones & ~timeouts,
             "ends": ends,
             "next_observations": next_states,
-            "scaled": np.ones(size, bool),
         }
         parts.append((f"environment {env} of {name}", columns))
-    return Log(name, None, parts)
+    return Log(name, None, parts, is_scaled=True)
 
 
 def read_minari(source: Any, progress_bar: bool) -> Log:

@@ -25,9 +25,9 @@ FARTHEST = 100.0
 class FirstGuess(nn.Module):
     """A model of one step, rolled out over the actions since the observation, and a clone that answers where it ends.
 
-    A planner learns one mask of each window, at many times the price of a plain network's sample. So these two know
-    sooner how a task moves and which action its data has for a present; but the model's errors compound, and the clone
-    knows nothing of them. That is the planner's to mend: it is shown the guess, and not bound to it.
+    These two learn sooner than the planner how a task moves and what its data does, as a sample costs a plain network
+    little. But the model's errors compound, and the clone does not know of them. The planner is shown the guess, and
+    may depart from it.
 
     States are z-scored, actions in [-1, 1].
     """

@@ -77,8 +77,8 @@ class OneStepModel(nn.Module):
     def loss(self, states: th.Tensor, actions: th.Tensor, follows: th.Tensor) -> th.Tensor:
         """Return the mean over entries of log(1 + e / RIGHT), e an entry's mean squared error of one step, in moves.
 
-        That is the negative log-likelihood, but for constants, of entries that are off by variances of their own, which
-        the batch tells. A plain mean would be about what cannot be foreseen: 78 of Ant-v5's 105 entries are contact
+        Up to constants it is the negative log-likelihood of Gaussian errors, each entry with a variance of its own, as
+        the batch has it. A plain mean would be about what cannot be foreseen: 78 of Ant-v5's 105 entries are contact
         forces (measured, results/what_diffusion_buys.md).
 
         :param states: (B, 2, obs_dim), one after the other

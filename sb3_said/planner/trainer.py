@@ -189,8 +189,17 @@ class PlannerTrainer:
             return True
         passes = -(-GUESS_PASSES * len(self.source) // GUESS_BATCH_SIZE)
         n_updates = min(GUESS_UPDATES, GUESS_UPDATES_EACH * self.gradient_steps, passes)
-        drawn = self.average.normalizer, self.config, n_updates, self.generator
-        if not fit_first_guess(guess, self.source, *drawn, progress_bar, should_stop, self.older):
+        if not fit_first_guess(
+            guess,
+            self.source,
+            self.average.normalizer,
+            self.config,
+            n_updates,
+            self.generator,
+            progress_bar=progress_bar,
+            should_stop=should_stop,
+            older=self.older,
+        ):
             return False
         self.older = None  # which on a GPU is another copy of the replay
         guess.requires_grad_(False)
@@ -229,21 +238,17 @@ class PlannerTrainer:
 
     def train(
         self, n_steps: int | None = None, callback: Callable[[PlannerTrainer], bool | None] | None = None
-    ) -> bool:
+    ) -> None:
         """Make up to ``n_steps`` updates, by default all that are left, and hand the average over.
 
         :param callback: called with the trainer after every update; training stops when it returns False
-        :return: whether it ran to the end
         :raises FloatingPointError: when an update was not finite; the planner stays as it was
         """
-        runs = True
         for _ in range(self.gradient_steps - self.n_updates if n_steps is None else n_steps):
             self.step()
             if callback is not None and callback(self) is False:
-                runs = False
                 break
         self.hand_over()
-        return runs
 
     def hand_over(self) -> None:
         """Give the planner the averaged weights and their normaliser; before the first update, leave it as it is.

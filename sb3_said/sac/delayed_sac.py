@@ -212,9 +212,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
     def borrowed_env(self) -> Iterator[VecEnv]:
         """Hand out the training environment for steps that teach nothing.
 
-        ``VecNormalize`` keeps its statistics and leaves rewards as they are, and the files of SB3's ``Monitor`` keep
-        the episodes of training alone, but for environments in other processes. Learning, where it goes on, begins with
-        a new episode.
+        ``VecNormalize`` keeps its statistics and does not scale rewards. Files of SB3's ``Monitor`` get no rows of
+        these steps, except those of environments in other processes. Learning, where it goes on, starts a new episode.
         """
         assert self.env is not None
         envs = getattr(self.env.unwrapped, "envs", [])

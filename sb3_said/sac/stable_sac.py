@@ -126,10 +126,10 @@ class StableSAC(DelayedSAC):
             self._running_returns = self._running_returns * (1 - dones)
 
     def _look_at_states(self) -> None:
-        """Take the statistics of the states in replay, unless they are hardly more than last time, or fewer.
+        """Fit the z-scores to the states in replay, once there are a tenth more of them than last time.
 
-        The networks have learned in these units: from the few states of a replay that an agent without its own begins,
-        at first those of random actions, they would see another task (measured, results/stable_expert.md).
+        A replay with fewer is not looked at. An agent that goes on without its own would otherwise scale by a few
+        states of random actions, and its networks would see another task (measured, results/stable_expert.md).
         """
         normalizer = self.policy.state_normalizer
         if normalizer is None:

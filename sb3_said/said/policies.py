@@ -186,7 +186,7 @@ class SAIDPolicy(DelayedSACPolicy):
 
     @contextmanager
     def answering(self, who: Answer, at_once: bool = False) -> Iterator[None]:
-        """Let one of them answer ``predict`` for a while, whoever would otherwise.
+        """Let one of them answer ``predict`` inside the context, whatever :meth:`set_answer` said.
 
         :param who: as of :meth:`set_answer`
         :param at_once: answer the rows of a batch together: several times as fast, but an answer then differs by

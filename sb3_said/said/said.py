@@ -12,7 +12,6 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import configure_logger
@@ -21,6 +20,7 @@ from stable_baselines3.common.vec_env import unwrap_vec_normalize
 from sb3_said.delays.space import ages_of, has_state_history
 from sb3_said.files.archive import PathOrFile
 from sb3_said.offline import IQL, ImplicitValues, IQLConfig, OfflineAlgorithm, load_dataset
+from sb3_said.offline.learning import listed
 from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.planner.values import returns_to_go
@@ -170,10 +170,8 @@ class SAID(OfflineAlgorithm, StableSAC):
         A :class:`PlannerTrainingCallback` among the callbacks trains the planner, and otherwise one that is added. The
         expert answers all callbacks, such as ``EvalCallback``, also when the planner has been trained before.
         """
-        if not isinstance(callback, (BaseCallback, list, tuple)):
-            callback = [] if callback is None else ConvertCallback(callback)
-        callbacks = list(callback) if isinstance(callback, (list, tuple)) else [callback]
-        callbacks.append(PlannerTrainingCallback(progress_bar=progress_bar))  # after the user's it has nothing to do
+        # After the user's own it has nothing to do
+        callbacks = [*listed(callback), PlannerTrainingCallback(progress_bar=progress_bar)]
         with self.policy.answering("expert"):
             return super().learn(
                 total_timesteps,

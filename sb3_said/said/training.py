@@ -28,12 +28,9 @@ class PlannerTraining:
 
     :param model: whose planner it is
     :param trainer: of the planner
-    :param values: trained beside it, None for none
+    :param value_trainer: trained beside it, None for none
     :param row: maps the updates made to where in the log their row stands
-    :param folder: keep a checkpoint there, and continue from it if it is of the same training
-    :param log_interval: updates between two rows of losses in the log
-    :param eval_interval: updates between two measurements of the held-out errors, beside the regression's
-    :param save_interval: updates between two checkpoints; by default time decides, as for those of environment steps
+    :param folder: this and the next three as of :meth:`~sb3_said.said.SAID.train_planner`
     :param watcher: whose ``EvalCallback`` evaluations the checkpoint keeps, too
     :raises SavedFileError: when the checkpoint is damaged, of a training with other settings, or of one on other logs
     """
@@ -42,15 +39,15 @@ class PlannerTraining:
         self,
         model: SAID,
         trainer: PlannerTrainer,
-        values: IQL | None,
+        value_trainer: IQL | None,
         row: Callable[[int], int],
-        folder: str | Path | None = None,
-        log_interval: int = 500,
-        eval_interval: int = 2_000,
-        save_interval: int | None = None,
+        folder: str | Path | None,
+        log_interval: int,
+        eval_interval: int,
+        save_interval: int | None,
         watcher: BaseCallback | None = None,
     ):
-        self.model, self.trainer, self.values, self.row = model, trainer, values, row
+        self.model, self.trainer, self.value_trainer, self.row = model, trainer, value_trainer, row
         self.log_interval, self.eval_interval, self.save_interval = log_interval, eval_interval, save_interval
         self._clock = None if folder is None else CheckpointClock(Path(folder) / PLANNER_CHECKPOINT_NAME)
         self.watcher = watcher
@@ -64,8 +61,8 @@ class PlannerTraining:
                     advice = "Give what it began with, or another folder."
                     check_same("The planner's training was begun", state["weighed"], self._weighed, advice)
                     trainer.load_state_dict(state["trainer"])
-                    if values is not None:
-                        values.load_state_dict(state["values"])
+                    if value_trainer is not None:
+                        value_trainer.load_state_dict(state["values"])
                     restore_evaluations(watcher, state.get("evaluations", []))
                 elif watcher is not None:  # learning from logs, which one training in a folder does
                     raise ValueError("it is of a training on other data; give the same logs, or another folder")
@@ -109,7 +106,6 @@ class PlannerTraining:
                 outcome = "stopped"
         except KeyboardInterrupt:
             outcome = "interrupted"
-        if outcome == "interrupted":
             result = "keeps what it learned" if trainer.n_updates > 0 else "stays as it was"
             print(f"Planner training interrupted after {trainer.n_updates} of {total} updates; it {result}.")
         self.hand_over()
@@ -123,8 +119,8 @@ class PlannerTraining:
         self.trainer.hand_over()
         if self.trainer.n_updates > 0:
             self.model.policy.planner_updates.fill_(float(self.trainer.n_updates))
-            if self.values is not None:
-                self.model.policy.values.load_state_dict(self.values.values.state_dict())
+            if self.value_trainer is not None:
+                self.model.policy.values.load_state_dict(self.value_trainer.values.state_dict())
 
     def log(self, values: dict[str, float]) -> None:
         """Write a row with a logger of its own, to the same places: the user's keeps what it holds for its next row."""
@@ -138,10 +134,10 @@ class PlannerTraining:
         return clock.is_due() if self.save_interval is None else n_updates % self.save_interval == 0
 
     def _train_values(self) -> None:
-        if self.values is None:
+        if self.value_trainer is None:
             return
-        for _ in range(self.values.values.config.updates):
-            self._value_losses = self.values.step()
+        for _ in range(self.value_trainer.values.config.updates):
+            self._value_losses = self.value_trainer.step()
 
     def _log_row(self, evaluates: bool) -> float:
         """Write losses, and the held-out errors if asked for; return the loss."""
@@ -160,7 +156,7 @@ class PlannerTraining:
 
     def _save_or_warn(self, clock: CheckpointClock) -> None:
         """Write a checkpoint; a full disk is no reason to lose the planner itself."""
-        values = None if self.values is None else self.values.state_dict()
+        values = None if self.value_trainer is None else self.value_trainer.state_dict()
         state = {**self._data, "weighed": self._weighed, "trainer": self.trainer.state_dict(), "values": values}
         try:
             save_tree(clock.path, {**state, "evaluations": evaluations_of(self.watcher)})
