@@ -1,5 +1,6 @@
 # make install   the virtual environment .venv, with everything
 # make train     trains SAID on a MuJoCo task under delay, evaluates it beside its expert and draws a plot
+# make report    README's table and picture, from the raw files of results/
 # make demo      draws demo.gif: a trained agent under delay, beside itself as if it did not know of it
 # make test      lint, types and tests: what CI runs
 # make format    rewrites the code as `make lint` wants it
@@ -17,7 +18,12 @@ PRESET := quick
 LOGS := logs
 EPISODES := 20
 
-.PHONY: install train demo test lint type pytest format clean
+# What README's table is of; in the last one the trial lets the expert answer
+AGENTS := hopper_longer_horizon hopper_seed3 walker2d walker2d_seed2 walker2d_seed3 halfcheetah halfcheetah_seed2 \
+	ant ant_seed2 ant_seed3
+EXPERTS := halfcheetah_seed3
+
+.PHONY: install train report demo test lint type pytest format clean
 
 install: $(VENV)/.installed
 
@@ -37,6 +43,10 @@ train: install
 	$(PY) -u scripts/train.py --algo $(ALGO) --env $(ENV) --delay $(DELAY) --preset $(PRESET) -f $(LOGS) | tee -i $$log; \
 	run=$$(sed -n 's/^Saving to //p' $$log); rm -f $$log; test -n "$$run" && \
 	$(PY) scripts/evaluate.py "$$run" --episodes $(EPISODES) --num-threads 1 --plot "$$run/evaluation.png"
+
+report: install
+	$(PY) benchmarks/online_table.py $(AGENTS:%=results/agents/%.json) \
+		--expert-answers $(EXPERTS:%=results/agents/%.json) --plot results/agents/agents.png
 
 demo: install
 	$(PY) scripts/enjoy.py agents/hopper.zip --delay 8 --beside-ignorant --size 240 --fps 12 --record demo.gif
