@@ -14,9 +14,9 @@ STATE_KEYS = ("state_history", "state_known")
 UNDELAYED = "undelayed_observation"
 #: Key in ``info`` of what the task was given, where that is not the action sent last.
 EXECUTED = "executed_action"
-#: What to do about a wrapper that changed delayed observations.
+#: What to do about a wrapper that changed delayed observations, or actions.
 WRAPPER_ORDER = (
-    "Wrappers that change observations go below DelayedObservationWrapper, around the task itself; "
+    "Wrappers that change observations or actions go below DelayedObservationWrapper, around the task itself; "
     "gymnasium.wrappers.FrameStackObservation and FlattenObservation do there what VecFrameStack does."
 )
 

@@ -122,6 +122,7 @@ class DelayedObservationWrapper(
         self._actions = np.zeros((n, *act_space.shape), np.float32)  # a_{t-D-1..t-1}, each beside the state it led to
         self._states = np.zeros((n, *obs_space.shape), np.float32)  # s_{t-D..t}
         self._known = np.zeros(n, np.float32)  # which of these were handed out
+        self._shown = 0  # age of the state that was handed out last
 
     def make_receivers(self) -> tuple[NewestPacket, Actuator | None]:
         """Return new receivers of observations, and of actions where each takes a time of its own."""
@@ -135,6 +136,16 @@ class DelayedObservationWrapper(
     def age_range(self) -> tuple[int, int]:
         """The smallest and the largest ``delay`` amid an episode; numbers, for workers of vectorised environments."""
         return age_range(self.process)
+
+    @property
+    def task_id(self) -> str | None:
+        """Id of the task, where it has one; a word, for workers, who cannot send every ``spec``."""
+        return None if self.spec is None else self.spec.id
+
+    @property
+    def handed_out(self) -> dict[str, np.ndarray]:
+        """The state and the action history that were handed out last."""
+        return {"observation": self._states[-1 - self._shown], "action_history": self._actions[1:]}
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -186,7 +197,7 @@ class DelayedObservationWrapper(
         """Hand out the state of an age; ``lag`` actions sent before that state do not show in it yet."""
         _append(self._states, state)
         _append(self._known, 0.0)
-        self._known[-1 - age] = 1.0
+        self._known[-1 - age], self._shown = 1.0, age
         obs = {
             "observation": self._states[-1 - age].copy(),
             "action_history": self._actions[1:].copy(),

@@ -13,9 +13,11 @@ from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, ProgressBarCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import configure_logger
+from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_said.delays.receivers import Actuator, NewestPacket
 from sb3_said.delays.space import ages_of
-from sb3_said.offline.datasets import load_dataset
+from sb3_said.offline.datasets import Dataset, load_dataset
 from sb3_said.sac import DelayedSAC
 
 SelfOffline = TypeVar("SelfOffline", bound="OfflineAlgorithm")
@@ -53,6 +55,8 @@ class OfflineAlgorithm(DelayedSAC):
                 "The agent collects steps of its own now: its replay no longer holds the dataset.", stacklevel=3
             )
             self.replay_buffer, self._replays_logs = self._new_replay_buffer(), False
+        if self._n_updates == 0 and self.replay_buffer.size() == 0:  # what was counted are updates of learn_offline
+            self.num_timesteps = 0
         return super().learn(*args, **kwargs)
 
     def learn_offline(
@@ -132,19 +136,15 @@ class OfflineAlgorithm(DelayedSAC):
     def take_dataset(self, dataset: Any, progress_bar: bool = False) -> None:
         """Replace the replay buffer by a dataset, whose episodes are seen at the ages that this agent's delay gives.
 
-        A ``VecNormalize`` that learns takes the mean and variance of observations from it.
+        A ``VecNormalize`` that learns takes the mean and variance of observations and the size of returns from it.
 
         :param dataset: whatever :func:`~sb3_said.offline.load_dataset` reads
         :param progress_bar: show one
         :raises ValueError: as ``load_dataset`` does
         """
-        spec = None if self.env is None else self.env.get_attr("spec", 0)[0]
-        env_id = self.task if spec is None else spec.id
-        data = load_dataset(dataset, self.observation_space, self.action_space, env_id, progress_bar)
-        vec_normalize = self._vec_normalize_env
-        if vec_normalize is not None and vec_normalize.norm_obs and vec_normalize.training:
-            rms = vec_normalize.obs_rms
-            (rms["observation"] if isinstance(rms, dict) else rms).update(data.states)
+        data = load_dataset(dataset, self.observation_space, self.action_space, self.task, progress_bar)
+        if self._vec_normalize_env is not None and self._vec_normalize_env.training:
+            take_statistics(self._vec_normalize_env, data)
         self.replay_buffer = data.to_replay(
             self.observation_space,
             self.action_space,
@@ -159,22 +159,36 @@ class OfflineAlgorithm(DelayedSAC):
         is_delayed = isinstance(self.observation_space, spaces.Dict)
         if self.env is None or not is_delayed or not self.env.has_attr("age_range"):
             return None
-        receiver, actuator = self.env.env_method("make_receivers", indices=0)[0]
+        made = self.env.env_method("make_receivers")  # of environments whose delays may differ
         rng = np.random.default_rng(self.seed)
 
-        def step() -> int:
+        def step(receiver: NewestPacket, actuator: Actuator | None) -> int:
             if actuator is not None:
                 actuator.execute(np.zeros(()))
             age = receiver.step()
             return age if actuator is None else age + actuator.lag(age)
 
         def draw(n_steps: int) -> np.ndarray:
+            receiver, actuator = made[int(rng.integers(len(made))) if len(made) > 1 else 0]
             if actuator is not None:
                 actuator.reset(rng.spawn(1)[0])
             receiver.reset(rng)
-            return np.array([0, *(step() for _ in range(n_steps))])
+            return np.array([0, *(step(receiver, actuator) for _ in range(n_steps))])
 
         return draw
+
+
+def take_statistics(vec_normalize: VecNormalize, data: Dataset) -> None:
+    """Let a ``VecNormalize`` learn from logged episodes what it would have in play, one after the other."""
+    if vec_normalize.norm_obs:
+        rms = vec_normalize.obs_rms
+        (rms["observation"] if isinstance(rms, dict) else rms).update(data.states)
+    if vec_normalize.norm_reward:
+        returns, value = np.zeros(len(data)), 0.0
+        for i, (reward, ends) in enumerate(zip(data.rewards, data.ends, strict=True)):
+            returns[i] = value = vec_normalize.gamma * value + reward
+            value = 0.0 if ends else value
+        vec_normalize.ret_rms.update(returns)
 
 
 def listed(callback: MaybeCallback | tuple[BaseCallback, ...]) -> list[BaseCallback]:

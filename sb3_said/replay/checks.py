@@ -68,5 +68,6 @@ def check_order(
         raise ValueError(
             f"The observation after the action of environment {np.argwhere(differs)[0, 0]} does not follow the one "
             "before it: its action_history is not the same with one action more. Transitions must be added in the "
-            "order they happened, and each of them."
+            "order they happened, and each of them. If a callback or evaluate_policy steps the training environment "
+            "during learn(), give it an environment of its own."
         )

@@ -33,6 +33,8 @@ from sb3_said.files.archive import load_tree, readable, save_tree
 from sb3_said.replay.buffer import DelayedReplayBuffer
 from sb3_said.sac.policies import DelayedSACPolicy, as_array
 
+UNCHANGED = 1e-3  # of [-1, 1]: what a wrapper's arithmetic in float32 may be off by
+
 
 class DelayedSAC(SafeSaveMixin, SAC):
     """SAC whose actor knows the actions sent since and whose critics know the true state (SADR).
@@ -94,6 +96,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
                 f"DelayedSAC learns from one-step targets, got n_steps={sac_kwargs['n_steps']}; leave it 1."
             )
         self.trained_ages: list[int] | None = None  # amid episodes, in the latest call of learn()
+        self._has_warned_of_actions = False
         self.augment_state = augment_state
         self.delay_reconciled_critic = delay_reconciled_critic
         self.relabelled_ages = relabelled_ages
@@ -134,12 +137,14 @@ class DelayedSAC(SafeSaveMixin, SAC):
     def _note_task(self) -> None:
         """Remember what files name: the task's id, and whether its observations are normalised.
 
-        Environments in other processes do not tell the id; whoever makes them may know it.
+        Environments without delay in other processes do not tell the id; whoever makes them may know it.
         """
         self.reads_normalized = self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
         env = None if self.env is None else self.env.unwrapped
         if isinstance(env, DummyVecEnv) and env.envs[0].spec is not None:
             self.task = env.envs[0].spec.id
+        elif env is not None and env.has_attr("task_id"):
+            self.task = env.get_attr("task_id", 0)[0] or self.task
 
     def _check_env(self, env: GymEnv) -> None:
         """Refuse spaces that are not served, and what no space tells of an environment, with a ``ValueError``."""
@@ -171,12 +176,22 @@ class DelayedSAC(SafeSaveMixin, SAC):
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
         obs = self._last_obs if self._vec_normalize_env is None else self._last_original_obs
-        if obs is not None and not self.replay_buffer.knows_past(obs).all():  # emptied, or not loaded with the agent
+        # The replay was emptied, or not loaded with the agent, or somebody has played the environments
+        if obs is not None and not (self.replay_buffer.knows_past(obs).all() and self._are_at(obs)):
             self._last_obs = None  # SB3 then resets the environments
+        self._note_task()
         name = type(self).__name__ if tb_log_name == "SAC" else tb_log_name  # SB3's default would be all algorithms'
         learn = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, name, progress_bar)
         self.trained_ages = ages_of(self.env)
         return learn
+
+    def _are_at(self, obs: np.ndarray | dict[str, np.ndarray]) -> bool:
+        """Tell whether the environments handed out these observations last; those without delay do not say."""
+        assert self.env is not None
+        if not isinstance(obs, dict) or not self.env.has_attr("handed_out"):
+            return True
+        last = self.env.get_attr("handed_out")
+        return all(np.array_equal(obs[key][i], part) for i, parts in enumerate(last) for key, part in parts.items())
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
         """Collect as SB3 does, which does not store the step at which a callback ends training, or an exception.
@@ -196,9 +211,27 @@ class DelayedSAC(SafeSaveMixin, SAC):
             self._begin_episodes()
         return super()._sample_action(*args, **kwargs)
 
-    def _store_transition(self, *args: Any, **kwargs: Any) -> None:
-        if self._last_obs is not None:  # else a callback has played at this very step, whose observation is gone
-            super()._store_transition(*args, **kwargs)
+    def _store_transition(
+        self,
+        replay_buffer: Any,
+        buffer_action: np.ndarray,
+        new_obs: Any,
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        if self._last_obs is None:  # a callback has played at this very step, whose observation is gone
+            return
+        if self.policy.max_delay > 0 and not self._has_warned_of_actions:
+            off = np.abs(new_obs["action_history"][:, -1] - buffer_action)[~dones]  # (n, act_dim)
+            if off.max(initial=0.0) > UNCHANGED:
+                self._has_warned_of_actions = True
+                warnings.warn(
+                    "A wrapper around DelayedObservationWrapper changes actions on their way: the history has others "
+                    f"than the agent sends, by up to {off.max():.3g} of [-1, 1]. {WRAPPER_ORDER}",
+                    stacklevel=5,
+                )
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def _begin_episodes(self) -> None:
         """Reset the environments, as SB3 does where learning begins."""
@@ -255,8 +288,16 @@ class DelayedSAC(SafeSaveMixin, SAC):
                 f" where its delays allow, give it DelayedObservationWrapper(..., max_delay={own})."
             )
         self.check_ages(ages_of(env))
+        was_normalized = self.reads_normalized and self.trained_ages is not None
         super().set_env(env, force_reset)
         self._note_task()
+        if was_normalized and not self.reads_normalized:
+            self.reads_normalized = True  # until it learns here
+            warnings.warn(
+                f"This {type(self).__name__} learned from observations that VecNormalize had normalised, and those of "
+                "this environment are not: give it load_normalization(path, venv), or SB3's VecNormalize.load.",
+                stacklevel=3,
+            )
 
     def check_ages(self, ages: list[int]) -> None:
         """Warn where an agent is to act on observations of ages that it has not met in training, amid episodes.

@@ -42,7 +42,7 @@ class ReturnScale(OnTheHost):
         for name, start in (("mean", 0.0), ("variance", 1.0), ("count", 1e-4), ("largest", 0.0)):
             self.register_buffer(name, th.tensor(start, dtype=th.float64))
         self.register_buffer("value", th.ones(()), persistent=False)
-        self.register_load_state_dict_post_hook(lambda module, _: module._take_value())
+        self.register_load_state_dict_post_hook(_take_value)
 
     def update(self, returns: np.ndarray) -> None:
         """Count the running returns of a step, (n_envs,) (Chan et al.'s parallel variance)."""
@@ -53,11 +53,13 @@ class ReturnScale(OnTheHost):
         self.mean.fill_(mean + difference * n / total)
         self.count.fill_(total)
         self.largest.fill_(max(float(self.largest), float(np.abs(returns).max())))
-        self._take_value()
+        _take_value(self)
 
-    def _take_value(self) -> None:
-        size = float(th.maximum(self.variance.sqrt(), self.largest / LARGEST_SCALED_RETURN).float())
-        self.value.fill_(size if size > 0 else 1.0)
+
+def _take_value(scale: ReturnScale, _: object = None) -> None:
+    """Set its ``value``; a function of the module, which can be pickled as a hook."""
+    size = float(th.maximum(scale.variance.sqrt(), scale.largest / LARGEST_SCALED_RETURN).float())
+    scale.value.fill_(size if size > 0 else 1.0)
 
 
 class StateNormalizer(OnTheHost):

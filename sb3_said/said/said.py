@@ -352,7 +352,14 @@ class SAID(OfflineAlgorithm, StableSAC):
             self.set_answer("planner")
             n_episodes = self.planner_trial_episodes if trial_episodes is None else trial_episodes
             if outcome == "done" and n_episodes > 0 and self.env is not None:
-                training.log(let_the_best_answer(self, n_episodes, progress_bar, should_stop))
+                if self.replay_buffer.dones[: self.replay_buffer.size()].any():
+                    training.log(let_the_best_answer(self, n_episodes, progress_bar, should_stop))
+                else:
+                    warnings.warn(
+                        "No episode has ended in what the agent has stored, so a trial might never end: the planner "
+                        "answers as it is. train_planner() plays one later; set_answer() and set_planner() choose.",
+                        stacklevel=2,
+                    )
         if outcome == "stopped":
             raise KeyboardInterrupt
         self._planner_trained_at = self.num_timesteps

@@ -58,7 +58,9 @@ class OfflineExperimentManager(DelayedExperimentManager):
         return super().create_envs(n_envs, eval_env, no_log=True)
 
     def create_callbacks(self) -> None:
+        n_envs, self.n_envs = self.n_envs, 1  # by which rl_zoo3 divides how often; a gradient step is one step
         super().create_callbacks()  # whose bar counts the steps of environments
+        self.n_envs = n_envs
         self.callbacks = [c for c in self.callbacks if not isinstance(c, ProgressBarCallback)]
 
     def _set_evaluation(self) -> None:

@@ -4,6 +4,7 @@ import copy
 import csv
 from dataclasses import replace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -88,6 +89,29 @@ def test_ages_are_those_of_play(learned):
     varying.take_dataset(demonstrations())
     ages = varying.replay_buffer.ages[:1200, 0].reshape(-1, 30)
     assert set(ages[:, 5]) == {0, 1, 2} and (ages[:, 0] == 0).all() and (np.diff(ages[:, 3:]) == 0).all()
+
+
+def test_ages_are_those_of_each_environment():
+    model = make(DummyVecEnv([lambda: delayed(1, max_delay=4), lambda: delayed(4)]))
+    model.take_dataset(demonstrations())
+    ages = model.replay_buffer.ages[:1200, 0].reshape(-1, 30)[:, 5]
+    assert model.learn_offline(None, 1).trained_ages == [1, 4]
+    assert set(ages) == {1, 4} and 10 < (ages == 4).sum() < 30
+
+
+def test_a_log_is_read_where_a_worker_cannot_send_the_task_s_spec():
+    def make_env():
+        task = gym.wrappers.TransformAction(gym.make("Pendulum-v1"), lambda action: action, None)
+        return DelayedObservationWrapper(task, 2)
+
+    env = SubprocVecEnv([make_env])
+    try:
+        states, actions = np.zeros((9, 3), np.float32), np.zeros((9, 1), np.float32)
+        ends = np.arange(9) == 8
+        data = Dataset(states, actions, np.zeros(9, np.float32), np.zeros(9, bool), ends, states[:1])
+        assert make(env).learn_offline(data, 1).num_timesteps == 1
+    finally:
+        env.close()
 
 
 def test_ages_count_the_actions_on_their_way_as_play_does():

@@ -5,6 +5,7 @@ import pytest
 import torch as th
 from small_task import Drift, delayed
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from test_bc import demonstrations
 from torch.nn import functional as F
 
@@ -29,6 +30,24 @@ def observe(model, n=5):
         return np.stack(rows)
     batch = {key: np.stack([row[key] for row in rows]) for key in rows[0]}
     return batch | {"delay": np.round(batch["delay"])}
+
+
+def test_vec_normalize_scales_the_rewards_of_logs_as_it_would_in_play():
+    data = demonstrations(8)
+    data.rewards[:] = np.random.default_rng(0).normal(-30.0, 10.0, len(data))
+    env = VecNormalize(DummyVecEnv([delayed]), norm_obs_keys=["observation"], gamma=0.9)
+    model = make(env)
+    model.take_dataset(data)
+    played = VecNormalize(DummyVecEnv([delayed]), norm_obs=False, gamma=0.9)
+    for reward, ends in zip(data.rewards, data.ends, strict=True):
+        played._update_reward(np.array([reward]))
+        played.returns[ends] = 0.0
+    assert env.ret_rms.var == pytest.approx(played.ret_rms.var, rel=1e-3)
+    rewards = model.replay_buffer.sample(500, env=env).rewards
+    assert rewards.std() > 0.05 and rewards.abs().max() < 1.0
+    env.training = False  # a deployed one stays as it is
+    model.take_dataset(demonstrations(5))
+    assert env.ret_rms.var == pytest.approx(played.ret_rms.var, rel=1e-3)
 
 
 @pytest.mark.parametrize("n_steps", [1, 5, 20])

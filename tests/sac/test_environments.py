@@ -137,6 +137,48 @@ def test_wrappers_of_observations_go_below_ours(wrap):
         assert make(env).learn(30).replay_buffer.observations.shape[-1] == 3
 
 
+def test_wrappers_that_change_actions_go_below_ours_too():
+    narrow = spaces.Box(-1.0, 1.0, (1,), np.float32)
+    above = gym.wrappers.TransformAction(delayed(), lambda action: action, narrow)
+    with pytest.warns(UserWarning, match=r"changes actions on their way.*go below DelayedObservationWrapper") as caught:
+        make(above).learn(30)
+    assert len(caught) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        make(DelayedObservationWrapper(gym.wrappers.TransformAction(Drift(), lambda action: action, narrow), 2)).learn(
+            30
+        )
+        make(gym.wrappers.RescaleAction(delayed(), np.float32(-1), np.float32(1))).learn(30)  # bounds become bounds
+        make(DelayedObservationWrapper(Drift(), 1, "UniformDelay(0, 2)")).learn(30)
+
+
+def test_an_agent_of_normalised_observations_is_not_let_into_others_in_silence(tmp_path):
+    model = make(VecNormalize(make_vec_env(delayed), norm_obs_keys=["observation"])).learn(30)
+    model.save(tmp_path / "agent")
+    said = r"DelayedSAC learned from observations that VecNormalize had normalised.*load_normalization"
+    with pytest.warns(UserWarning, match=said):
+        loaded = DelayedSAC.load(tmp_path / "agent", env=delayed())
+    with pytest.warns(UserWarning, match=said):
+        model.set_env(delayed())
+    assert loaded.reads_normalized and model.reads_normalized
+    loaded.save(tmp_path / "again")
+    assert DelayedSAC.load(tmp_path / "again").reads_normalized
+    assert not model.learn(30).reads_normalized  # of which it has learned by now
+
+
+@pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])
+def test_environments_tell_their_task_from_other_processes_too(vec_env_cls):
+    def make_env():
+        task = gym.wrappers.TransformAction(gym.make("Pendulum-v1"), lambda action: action, None)
+        return DelayedObservationWrapper(task, 2)
+
+    vec = vec_env_cls([make_env])  # whose spec cannot be pickled
+    try:
+        assert make(vec).task == "Pendulum-v1"
+    finally:
+        vec.close()
+
+
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [

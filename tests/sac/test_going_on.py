@@ -8,8 +8,9 @@ import pytest
 from kill import Kill, Killed
 from small_agent import make as make_agent
 from small_task import Drift, delayed
-from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_said import DelayedSAC, StableSAC
@@ -126,6 +127,28 @@ def test_a_callback_may_play_the_environment_after_a_step(make_env, cls, monkeyp
     model.learn(70, callback=Play())
     assert model.num_timesteps == 70 and len(rows) == 70 - 4  # whose observations are gone
     assert_replay_is_what_happened(model, rows)
+
+
+def normalized():
+    return VecNormalize(make_vec_env(lambda: delayed(4), n_envs=1), norm_obs_keys=["observation"])
+
+
+@pytest.mark.parametrize("make_env", [lambda: delayed(4), lambda: delayed(0), normalized], ids=["4", "0", "normalised"])
+@pytest.mark.parametrize("n_episodes", [1, 2])
+def test_the_environment_may_be_played_between_two_calls(make_env, n_episodes, monkeypatch):
+    model = make(make_env())
+    rows = record(model, monkeypatch)
+    model.learn(25)
+    evaluate_policy(model, model.get_env(), n_episodes, warn=False)
+    model.learn(30, reset_num_timesteps=False)
+    assert len(rows) == 55 and model.replay_buffer.steps[24:26, 0].tolist() == [0, 0]
+    assert_replay_is_what_happened(model, rows)
+
+
+def test_who_plays_the_environment_during_learning_is_told_what_to_do():
+    env = make_vec_env(lambda: delayed(4), n_envs=1)
+    with pytest.raises(ValueError, match=r"evaluate_policy.*an environment of its own"):
+        make(env).learn(40, callback=EvalCallback(env, eval_freq=20, n_eval_episodes=1, warn=False, verbose=0))
 
 
 def test_a_replay_emptied_during_training_is_refused_with_what_to_do():

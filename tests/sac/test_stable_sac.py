@@ -1,6 +1,7 @@
 """StableSAC: scales of rewards and states against NumPy and SB3, values in the rewards' own units, a slower actor."""
 
 import copy
+import pickle
 from functools import partial
 
 import gymnasium as gym
@@ -11,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from small_agent import make as make_agent
+from small_agent import observe
 from small_task import Drift, delayed
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.running_mean_std import RunningMeanStd
@@ -419,3 +421,12 @@ def test_beside_vec_normalize():
 def test_settings_out_of_range(given, message):
     with pytest.raises(ValueError, match=message):
         make(**given)
+
+
+@pytest.mark.parametrize("cls", [DelayedSAC, StableSAC, SAID])
+def test_policies_are_sent_to_other_processes_as_sb3s_are(cls):
+    """``SubprocVecEnv.set_attr("opponent", model.policy)`` does so, for self-play."""
+    model = make_agent(cls=cls).learn(40)
+    policy = pickle.loads(pickle.dumps(model.policy))
+    obs = observe()
+    np.testing.assert_array_equal(*(each.predict(obs, deterministic=True)[0] for each in (policy, model.policy)))

@@ -1,5 +1,6 @@
 """SAID from logs: no environment, values of its own, and the same files, callbacks and resumes as online."""
 
+import warnings
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -155,6 +156,21 @@ def test_after_logs_it_learns_online_from_steps_of_its_own(n_envs):
         model.learn(60)
     assert model.replay_buffer.size() * n_envs == 60 and model.replay_buffer.buffer_size == 500 // n_envs
     assert model.learn(20, reset_num_timesteps=False).replay_buffer.size() * n_envs == 80
+
+
+@pytest.mark.parametrize("is_loaded", [False, True])
+def test_steps_that_follow_updates_are_counted_from_the_first(is_loaded, tmp_path):
+    """Else states would be scaled by the first one, and no step be taken at random."""
+    model = learn(steps=40)
+    if is_loaded:
+        model.save(tmp_path / "agent.zip")
+        model = SAID.load(tmp_path / "agent.zip", env=delayed(), device="cpu")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model.learn(30, reset_num_timesteps=False)
+    assert model.num_timesteps == 30 and model._n_updates == 30 - 20  # learning_starts
+    normalizer = model.policy.state_normalizer
+    assert normalizer.fitted_at > 20 and (normalizer.deviation > 0.1).all()
 
 
 def test_other_logs_are_not_gone_on_with(tmp_path):

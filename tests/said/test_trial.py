@@ -154,6 +154,13 @@ def test_ages_that_change_within_an_episode_tell_nothing_of_it():
     np.testing.assert_array_equal(trial.play_trial(model, n_episodes=4).ages, np.zeros(4))
 
 
+def test_no_trial_waits_for_the_end_of_episodes_that_do_not_end():
+    env = DelayedObservationWrapper(gym.make("Pendulum-v1", max_episode_steps=-1), 2)
+    with pytest.warns(UserWarning, match="No episode has ended"):
+        model = make(env=env, planner_trial_episodes=2).learn(60)
+    assert model.policy.who_answers == "planner"
+
+
 def test_a_trial_can_be_stopped_and_the_planner_stays_trained(monkeypatch):
     monkeypatch.setattr(trainer_module, "GUESS_PASSES", 10_000)  # so that few rows do not end the guess sooner
     model, asked = make(env=pendulum(), planner_ways={}).learn(60), []

@@ -97,6 +97,11 @@ def test_a_run_leaves_its_agent_record_log_and_evaluations(finished: tuple[str, 
     assert column in (run / "progress.csv").read_text()
 
 
+def test_evaluations_come_by_gradient_steps_however_many_environments_there_are(log: Path, tmp_path: Path) -> None:
+    train_here(tmp_path, " ".join(command("bc", log)), *EVERY, *PARAMS["bc"], "n_envs:2")
+    assert np.load(run_of(tmp_path, "bc") / "evaluations.npz")["timesteps"].tolist() == [10, 20]
+
+
 def test_a_killed_run_ends_as_one_that_was_not(
     finished: tuple[str, Path], log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
