@@ -89,7 +89,7 @@ class DelayedObservationWrapper(
             self,
             delay=as_text(delay),  # an EnvSpec is written as JSON
             action_delay=as_text(action_delay),
-            max_delay=max_delay,
+            max_delay=None if max_delay is None else int(max_delay),
             receiver=receiver,
             state_history=state_history,
         )

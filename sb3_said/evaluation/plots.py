@@ -8,6 +8,7 @@ import math
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -140,7 +141,7 @@ def plot_over_delays(table: Mapping[str, Mapping[int | str, npt.ArrayLike]], tit
     :raises ValueError: for a table without returns
     """
     delays = list(dict.fromkeys(delay for row in table.values() for delay in row))
-    fixed = sorted(delay for delay in delays if isinstance(delay, int))
+    fixed = sorted(delay for delay in delays if isinstance(delay, Integral))
     random = [delay for delay in delays if isinstance(delay, str)]
     kinds: list[Sequence[int | str]] = [kind for kind in (fixed, random) if kind]
     if not kinds:

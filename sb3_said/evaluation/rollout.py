@@ -92,15 +92,17 @@ def rollout(
 
             going_on = {}  # by the row in this batch
             for row, (e, episode, _) in enumerate(playing):
-                observation, reward, terminated, truncated, _ = e.step(actions[row])
+                observation, reward, terminated, truncated, info = e.step(actions[row])
                 returns[episode] += float(reward)
                 lengths[episode] += 1
                 ended[episode] = terminated
                 changes[episode] += np.mean(np.abs(actions[row] - before.get(episode, actions[row])) / half_range)
-                before[episode] = actions[row]
+                before[episode] = np.array(actions[row])  # of a model that may write all its answers into one array
                 if on_step is not None:
                     on_step(e)
                 if terminated or truncated:
+                    if "episode" in info:  # of a Monitor below wrappers that change rewards, as in training
+                        returns[episode] = info["episode"]["r"]
                     if on_episode is not None:
                         on_episode(episode, float(returns[episode]), int(lengths[episode]))
                     if next_episode == n_episodes:

@@ -72,7 +72,7 @@ def checked_extra_states(
     :raises ValueError: for only one of the two, another shape than (B, D, obs_dim), or entries that mean nothing
     """
     if history is None and known is None:  # zeros, so that a recorded graph always has these inputs
-        return th.zeros(shape, device=device), th.zeros(shape[:2], dtype=th.bool, device=device)
+        return th.zeros(shape, dtype=th.float32, device=device), th.zeros(shape[:2], dtype=th.bool, device=device)
     if history is None or known is None:
         raise ValueError("Only one of state_history and state_known is given; give both or neither.")
     history = finite_tensor("state_history", history, shape, device)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -263,19 +264,20 @@ class InpaintingPlanner(nn.Module):
             n_candidates, noise = noise.shape[-3], noise[..., :length, :]
         elif n_candidates is None:
             n_candidates = 1 if value_fn is None else config.n_candidates
-        if n_candidates < 1 or not temperature >= 0:
+        if n_candidates < 1 or not 0 <= temperature < math.inf:
             raise ValueError(
-                f"n_candidates is {n_candidates} and temperature {temperature}, expected at least 1 and at least 0."
+                f"n_candidates is {n_candidates} and temperature {temperature}, expected at least 1, and finite and at "
+                "least 0."
             )
         n_steps = config.sampling_steps if sampling_steps is None else sampling_steps
         steps = diffusion.solver_steps(config.schedule, n_steps)
 
         if temperature == 0:
-            x = th.zeros(n, 1, *window, device=device)
+            x = th.zeros(n, 1, *window, dtype=th.float32, device=device)
         else:
             noise = self._noise((n, n_candidates, *window), generator) if noise is None else noise
             x = temperature * noise.expand(n, n_candidates, *window)  # (B, N, L, obs_dim + act_dim)
-        times = th.tensor([step.t for step in steps], device=device)
+        times = th.tensor([step.t for step in steps], dtype=th.float32, device=device)
         inputs = (times, observation, action_history, delay, x, *extra_states)
         if is_recorded:
             function = partial(self._inpaint, steps, value_fn, 0, True)
@@ -284,10 +286,10 @@ class InpaintingPlanner(nn.Module):
             plan = plan._replace(states=plan.states[:, :, :reached], actions=plan.actions[:, :, :reached])
         else:
             plan = self._inpaint(steps, value_fn, shortest, longest > shortest, *inputs)
-        if plan.values.isnan().any():
+        if plan.values.isnan().any() | ~plan.action.isfinite().all():
             raise ValueError(
-                "value_fn returned NaN, so that no candidate is the best; check the critic, and the observations, the "
-                f"largest of which is {observation.abs().max():.3g}."
+                "value_fn returned NaN or infinity, or -inf for all, so that no candidate is the best; check the "
+                f"critic, and the observations, the largest of which is {observation.abs().max():.3g}."
             )
         return plan
 
@@ -383,7 +385,7 @@ class InpaintingPlanner(nn.Module):
         rows = th.arange(len(x), device=x.device)
         present = states[rows, :, delay].mean(1)  # (B, obs_dim)
         if value_fn is None:
-            values = th.zeros(x.shape[:2], device=x.device)
+            values = x.new_zeros(x.shape[:2])
         else:
             values = score(value_fn, self.config, states, actions, delay, shortest)
         action = choose(actions[rows, :, delay], values, self.config.choice_factor)
@@ -465,7 +467,7 @@ class InpaintingPlanner(nn.Module):
 
     def _noise(self, shape: tuple[int, ...], generator: th.Generator | None) -> th.Tensor:
         source = self.device if generator is None else generator.device
-        return th.randn(shape, generator=generator, device=source).to(self.device)
+        return th.randn(shape, generator=generator, dtype=th.float32, device=source).to(self.device)
 
     def _trained_delay(self, delay: th.Tensor, action_history: th.Tensor) -> th.Tensor:
         """Return the delays to plan with: (B,) int64; with ``mask="fixed"`` D, at the start of an episode too.

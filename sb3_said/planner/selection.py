@@ -53,11 +53,16 @@ def choose(actions: th.Tensor, values: th.Tensor, factor: float | None) -> th.Te
     Where the present is uncertain, the most valuable of many candidates mostly owes its value to luck.
 
     :param actions: (B, N, act_dim)
-    :param values: (B, N)
+    :param values: (B, N), -inf for a candidate that is not to be taken
     :param factor: None for the most valuable
     :return: (B, act_dim)
     """
     if factor is None:
         return actions[th.arange(len(actions), device=actions.device), values.argmax(1)]
-    z = (values - values.mean(1, keepdim=True)) / values.std(1, correction=0, keepdim=True).clamp(min=1e-6)
-    return ((factor * z).softmax(1)[..., None] * actions).sum(1)
+    is_allowed = values > -th.inf
+    n = is_allowed.sum(1, keepdim=True)
+    mean = th.where(is_allowed, values, 0.0).sum(1, keepdim=True) / n
+    off = th.where(is_allowed, values - mean, 0.0)
+    z = off / (off.square().sum(1, keepdim=True) / n).sqrt().clamp(min=1e-6)
+    weights = th.where(is_allowed, factor * z, -th.inf).softmax(1)
+    return (weights[..., None] * actions).sum(1)

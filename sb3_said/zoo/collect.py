@@ -169,11 +169,14 @@ def main(argv: list[str] | None = None) -> None:
             raise ValueError(f"{error} A package that registers a task is named with --gym-packages.") from error
         if args.steps < len(shares):
             raise ValueError(f"--steps is {args.steps}, fewer than there are shares, {len(shares)}.")
-        parts = []
+        parts: list[list[Episode]] = []
+        used: dict[tuple[str, float], int] = {}  # reset seeds, of each agent at a noise level
         with tqdm(total=args.steps, unit="step") as bar:
             for i, share in enumerate(shares):
                 n_steps = args.steps * (i + 1) // len(shares) - args.steps * i // len(shares)
-                parts.append(play(share, n_steps, args.seed, args.n_envs, not args.stochastic, bar))
+                first = args.seed + used.get((share.name, share.noise), 0)  # else the same steps came again
+                parts.append(play(share, n_steps, first, args.n_envs, not args.stochastic, bar))
+                used[share.name, share.noise] = 1 + max(episode.seed for episode in parts[-1]) - args.seed
         run = shares[0].run
         told = [describe(share, part, run.info["env"]) for share, part in zip(shares, parts, strict=True)]
         about = json.dumps({**origin(run), "seed": args.seed, "shares": told})

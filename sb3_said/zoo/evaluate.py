@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import torch as th
@@ -78,6 +79,11 @@ def main(argv: list[str] | None = None) -> None:
         period: float = args.period or (args.realtime and control_period(run)) or 0.0
         if args.realtime and not period:
             raise ValueError(f"{run.info['env']} does not tell how long a control step is: give --period.")
+        name = "realtime.json" if args.realtime else "evaluation.json"
+        target = args.json or run.folder / (name if Path(args.run).is_dir() else f"{Path(args.run).stem}_{name}")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=target.parent):  # where that cannot be written, fail now, too
+            pass
 
     last_seed = args.seed + args.episodes - 1
     print(f"{run.info['algo']} on {run.info['env']}, delay {run.info['delay']}, reset seeds {args.seed}..{last_seed}")
@@ -105,8 +111,6 @@ def main(argv: list[str] | None = None) -> None:
     ]
     document["origin"] = origin(run)
     document |= {"period": period, "realtime": counted} if args.realtime else {}
-    name = "realtime.json" if args.realtime else "evaluation.json"
-    target = args.json or run.folder / (name if Path(args.run).is_dir() else f"{Path(args.run).stem}_{name}")
     write_json(target, document)
     print(f"Wrote {target}")
     if args.plot is not None:
@@ -184,7 +188,8 @@ def draw(path: Path, summaries: list[Summary], folder: Path, title: str) -> None
     :param title: names the task and its delay
     """
     drawings: list[Any] = [partial(plots.plot_returns, summaries)]
-    if any(folder.glob("*monitor.csv")):
+    has_episodes = any(len(file.read_text().splitlines()) > 2 for file in folder.glob("*monitor.csv"))
+    if has_episodes or any(folder.glob("**/evaluations.npz")):
         drawings.append(partial(plots.plot_learning_curve, folder))
     headers = [path.read_text().split("\n", 1)[0] for path in folder.glob("progress*.csv")]
     drawings += [

@@ -40,7 +40,7 @@ from sb3_said.zoo.folder import (
     log_suffix,
 )
 from sb3_said.zoo.presets import config_file, preset_overrides
-from sb3_said.zoo.record import EVALUATED, Record, make_wrapper, options_of, with_delay
+from sb3_said.zoo.record import EVALUATED, GIVEN_NAME, Record, make_wrapper, options_of, with_delay
 from sb3_said.zoo.stopping import Stopping, shielded
 
 LONGEST_NAME = 100  # of what a folder says of delays and logs; file systems end at 255
@@ -241,6 +241,11 @@ class DelayedExperimentManager(ExperimentManager):
             name = f"{self.env_name}{self.run.name}-seed{self.seed}"
             self._set_folder(claim_folder(Path(self.log_path), name, self._uuid))
             self.lock = hold_folder(self.folder)
+            if self.continue_training:
+                given, own = Path(self.trained_agent), self.folder / GIVEN_NAME
+                shutil.copyfile(given, own)
+                if (found := find_normalization(*find_agent(given))) is not None:
+                    shutil.copyfile(found, normalization_file(own))
         super().create_log_folder()
         self.monitor_kwargs["override_existing"] = not self.checkpoint.exists()
 

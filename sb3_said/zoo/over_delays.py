@@ -207,6 +207,16 @@ def open_runs(args: argparse.Namespace) -> dict[str, list[LoadedRun]]:
     tasks = sorted({run.info["env"] for row in runs.values() for run in row})
     if len(tasks) > 1:
         raise ValueError(f"Returns of several tasks cannot be compared: {tasks}. Give runs of one task, or --env.")
+    settings = {label: [setting_of(run) for run in row] for label, row in runs.items()}
+    for label, given in settings.items():
+        if len(set(given)) > 1:
+            raise ValueError(
+                f"The runs of {label} change their task in different ways, {', '.join(given)}, so they are no training "
+                "seeds of one setting: give each its own label."
+            )
+    if len({given for row in settings.values() for given in row}) > 1:
+        told = "; ".join(f"{label} has {row[0]}" for label, row in settings.items())
+        print(f"These are not the same task, beside the delay: {told}")
     return runs
 
 
@@ -218,9 +228,14 @@ def at_any_age() -> Iterator[None]:
         yield
 
 
+def setting_of(run: LoadedRun) -> str:
+    """Return what a run changes in its task but the delay of observations, as text."""
+    return json.dumps(run.changes, sort_keys=True, default=repr)
+
+
 def digest_of(run: LoadedRun) -> str:
     """Return the SHA-256 of an agent's file, and of what its run changes in the task but its delay, if anything."""
-    changes = json.dumps(run.changes, sort_keys=True, default=repr).encode() if run.changes else b""
+    changes = setting_of(run).encode() if run.changes else b""
     return hashlib.sha256(Path(run.info["file"]).read_bytes() + changes).hexdigest()
 
 

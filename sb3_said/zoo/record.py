@@ -25,6 +25,7 @@ from sb3_said.files.atomic import write_text
 from sb3_said.zoo.arguments import Delay, largest_delay
 
 RECORD_NAME = "run.json"
+GIVEN_NAME = "given.zip"  # the agent that a run began with (-i): it may be moved, or written over, before a resume
 WRAPPER = "sb3_said.delays.DelayedObservationWrapper"
 
 #: rl_zoo3's options that a resume keeps, by their whole names; those that it evaluates or runs are not among them.
@@ -117,6 +118,8 @@ class Record:
             document = json.loads(path.read_text())
             for name in ("hyperparams", "env_kwargs", "eval_env_kwargs"):
                 document[name] = {key: from_data(from_json(node)) for key, node in document[name].items()}
+            if (folder / GIVEN_NAME).is_file():  # the run's own copy
+                document["options"]["trained_agent"] = str(folder / GIVEN_NAME)
             return cls(**document)
         except (TypeError, KeyError, AttributeError, ValueError) as error:
             raise ValueError(f"{path} is damaged, or of another version of sb3_said: {error!r}.") from error

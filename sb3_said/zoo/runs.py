@@ -19,6 +19,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_said import DelayedSAC, __version__
@@ -133,7 +134,7 @@ def load_run(
     wrap = make_wrapper(wrappers) or (lambda task: task)
 
     def make_env() -> gym.Env[Any, Any]:
-        return wrap(make_task())
+        return wrap(Monitor(make_task()))  # which counts the task's own rewards, below wrappers that change them
 
     env = wrap(task)
     _check_spaces(model, env, file)

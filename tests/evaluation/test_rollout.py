@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from stable_baselines3.common.monitor import Monitor
 
 from sb3_said.evaluation import collect_observations, measure_latency, rollout
 
@@ -121,6 +122,26 @@ def test_falls_and_rough_actions(falls: bool) -> None:
     result = rollout(Alternates(), lambda: Waves(falls), 3, SEED, n_envs=3)
     assert result.terminated.tolist() == [falls] * 3
     np.testing.assert_allclose(result.action_changes, (2 / 2 + 1 / 5) / 2)  # of half ranges 2 and 5
+
+
+def test_a_model_may_write_its_answers_into_one_array() -> None:
+    class Alternates:
+        answers = np.zeros((1, 2))
+
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            self.answers[0, 0] = 1.0 - self.answers[0, 0]
+            return self.answers, None
+
+    np.testing.assert_allclose(rollout(Alternates(), lambda: Waves(False), 1, SEED).action_changes, 1 / 2 / 2)
+
+
+def test_below_wrappers_that_change_rewards_a_monitor_counts_the_tasks_own() -> None:
+    made = [lambda: gym.wrappers.TransformReward(Countdown(), lambda _: 7.0)]
+    made.append(lambda: gym.wrappers.TransformReward(Monitor(Countdown()), lambda _: 7.0))
+    returns, lengths = by_hand(5)
+    changed, own = (rollout(Model(), make_env, 5, SEED, 2).returns for make_env in made)
+    np.testing.assert_allclose(changed, 7.0 * np.array(lengths))
+    np.testing.assert_allclose(own, returns, atol=1e-5)
 
 
 def test_environments_that_are_done_leave_the_batch() -> None:

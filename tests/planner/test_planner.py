@@ -310,6 +310,45 @@ def test_value_function_must_give_one_number_per_state():
         planner.plan(*batch, value_fn=lambda states, actions: states[..., 0] * th.nan)
 
 
+@pytest.mark.parametrize("factor", [None, 1.5])
+def test_a_value_of_minus_infinity_forbids_a_candidate(factor):
+    settings = {"n_candidates": 9, "temperature": 1.0, "scored_states": "decision"}
+    planner, batch = make_planner(choice_factor=factor, **settings), make_batch(4)
+
+    def allowed_value(states, actions):
+        middle = actions[..., 0].median(1, keepdim=True).values
+        return th.where(actions[..., 0] < middle, states.sum(-1) + actions[..., 1], -th.inf)
+
+    plan, rows = planner.plan(*batch, value_fn=allowed_value, generator=seeded()), th.arange(4)
+    assert plan.values.isinf().any() and plan.values.isfinite().any(1).all()
+    for row in rows:
+        is_allowed, decisions = plan.values[row].isfinite(), plan.actions[row, :, batch[2][row]]
+        values = plan.values[row][is_allowed]
+        z = (values - values.mean()) / values.std(correction=0).clamp(min=1e-6)
+        expected = decisions[is_allowed][values.argmax()]
+        if factor is not None:
+            expected = (factor * z).softmax(0) @ decisions[is_allowed]
+        th.testing.assert_close(plan.action[row], expected)
+    for value in (-th.inf, th.inf):
+        with pytest.raises(ValueError, match="-inf for all, so that no candidate is the best"):
+            make_planner(choice_factor=1.0).plan(*batch, value_fn=lambda states, _, x=value: states[..., 0] * 0 + x)
+    with pytest.raises(ValueError, match="temperature inf, expected"):
+        planner.plan(*batch, temperature=float("inf"))
+
+
+@pytest.mark.parametrize("temperature", [0.0, 1.0])
+def test_the_default_dtype_of_torch_is_no_matter(temperature):
+    planner, batch = make_planner(temperature=temperature), make_batch(3)
+    expected = planner.plan(*batch, generator=seeded())
+    th.set_default_dtype(th.float64)
+    try:
+        found = planner.plan(*batch, generator=seeded())
+    finally:
+        th.set_default_dtype(th.float32)
+    for one, other in zip(found, expected, strict=True):
+        assert one.dtype == th.float32 and th.equal(one, other)
+
+
 def test_number_of_candidates_and_steps_can_be_set_per_call():
     planner, batch, calls = make_planner(), make_batch(2), []
     planner.network.register_forward_hook(lambda *_: calls.append(1))

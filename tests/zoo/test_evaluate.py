@@ -186,6 +186,13 @@ def test_evaluate_says_what_is_wrong(
     assert exit_info.value.code == 2 and message in capsys.readouterr().err
 
 
+def test_a_place_that_cannot_be_written_is_told_before_any_episode(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(evaluate, "evaluate", lambda *_, **__: pytest.fail("an episode was played"))
+    with pytest.raises(SystemExit) as exit_info:
+        evaluate.main([str(run), "--json", str(run / "run.json" / "numbers.json")])
+    assert exit_info.value.code == 1
+
+
 def test_paths_that_hold_no_agent(run: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="does not exist"):
         load_run(tmp_path / "nowhere")

@@ -374,6 +374,18 @@ def test_runs_of_two_tasks_are_refused(sadr: Path, tmp_path: Path, capsys: pytes
     assert "several tasks cannot be compared" in capsys.readouterr().err
 
 
+def test_runs_of_a_task_that_one_of_them_changes_are_no_seeds_of_one_setting(
+    sadr: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = write_run(tmp_path / "other", DelayedSAC, 2, seed=9)
+    Record("sadr", ENV, 9, 2, env_kwargs={"reset_noise_scale": 0.2}).write(other)
+    with pytest.raises(SystemExit):
+        play(tmp_path / "out.json", [f"x={sadr}", f"x={other}"], ["2"])
+    assert "The runs of x change their task in different ways" in capsys.readouterr().err
+    play(tmp_path / "out.json", [f"x={sadr}", f"y={other}"], ["2"])
+    assert 'not the same task, beside the delay: x has {}; y has {"env_kwargs"' in capsys.readouterr().out
+
+
 def test_an_age_that_is_told_wrong(said: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     play(tmp_path / "out.json", [f"any={said}"], ["1"], "--answer", "expert")
     document = play(tmp_path / "out.json", [f"any={said}"], ["1"], "--answer", "expert", "--age-errors", "-2", "1")

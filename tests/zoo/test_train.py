@@ -150,6 +150,7 @@ def test_a_given_agent_learns_as_many_steps_as_a_new_one(tmp_path: Path) -> None
     left, right = (agent.policy.actor.state_dict() for agent in (before, after))
     assert not all((left[key] == right[key]).all() for key in left)
     assert (second / "progress.csv").exists()  # the log of a new run, not of a resumed one
+    (first / name).unlink()  # the run has a copy of its own
     train.main(["--resume", str(second), "-n", "170"])  # a resume does go on from where the run was
     assert SAID.load(second / name).num_timesteps == 170
     assert (second / "progress_150.csv").exists()
