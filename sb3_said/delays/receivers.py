@@ -3,11 +3,38 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
 from sb3_said.delays.processes import DelayProcess, packet_delays
+
+
+class Draws:
+    """The delays of an episode's packets, one after the other. Copied or pickled amid it, it draws them once more.
+
+    :param process: how long packets take
+    :param rng: draws them; nobody else draws from it until the next episode
+    """
+
+    def __init__(self, process: DelayProcess, rng: np.random.Generator):
+        self.process, self.rng, self.n_drawn = process, rng, 0
+        self._began = rng.bit_generator.state
+        self._delays = packet_delays(process, rng)
+
+    def __next__(self) -> int | None:
+        self.n_drawn += 1
+        return next(self._delays)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_delays"}  # a generator
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self.rng.bit_generator.state = self._began
+        self._delays = packet_delays(self.process, self.rng)
+        for _ in range(self.n_drawn):
+            next(self._delays)
 
 
 class NewestPacket:
@@ -26,7 +53,7 @@ class NewestPacket:
 
     def reset(self, rng: np.random.Generator) -> None:
         """Start an episode: packet 0 is there, with age 0. Until the next reset, ``rng`` draws the delays."""
-        self._delays: Iterator[int | None] = packet_delays(self.process, rng)
+        self._delays = Draws(self.process, rng)
         self._arriving = [0] * len(self._arriving)
         self._step = self._newest = 0
         #: Packets of this episode that were delivered because the age would have exceeded ``max_delay``.

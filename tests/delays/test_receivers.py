@@ -1,13 +1,16 @@
 """The age of what a receiver holds: exact against a naive log of arrivals, and in distribution against closed forms."""
 
 import copy
+import pickle
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_processes import processes
 
+from sb3_said import DelayedObservationWrapper
 from sb3_said.delays import (
     WIFI_20MS,
     DistributionDelay,
@@ -15,10 +18,11 @@ from sb3_said.delays import (
     EpisodeDelay,
     FixedDelay,
     PeriodicPackets,
+    RandomWalkDelay,
     UniformDelay,
 )
 from sb3_said.delays.processes import packet_delays
-from sb3_said.delays.receivers import IndependentDraw, NewestPacket
+from sb3_said.delays.receivers import RECEIVERS, IndependentDraw, NewestPacket
 
 
 def ages(receiver, n, seed=0):
@@ -140,11 +144,31 @@ def test_ages_of_independent_draws_are_the_distribution():
 # ---------------------------------------------------------------------------------------------------- copies
 
 
-def test_a_receiver_of_one_delay_an_episode_can_be_copied_amid_it():
-    receiver = NewestPacket(EpisodeDelay(2, 9))
-    ages(receiver, 4)
-    twin = copy.deepcopy(receiver)
-    assert [receiver.step() for _ in range(9)] == [twin.step() for _ in range(9)]
+COPIED = [
+    (EpisodeDelay(2, 9), 0),
+    (UniformDelay(0, 8), 0),
+    (DroppedPackets(UniformDelay(0, 8), p=0.3), 0),
+    (RandomWalkDelay(0, 8, move_prob=0.5), UniformDelay(0, 3)),
+]
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
+@pytest.mark.parametrize(("delay", "action_delay"), COPIED, ids=str)
+@pytest.mark.parametrize("receiver", RECEIVERS)
+def test_a_task_is_copied_amid_an_episode_with_all_that_will_come(delay, action_delay, receiver, copied):
+    """As tasks without delay can be, which planning by trial needs."""
+    env = DelayedObservationWrapper(gym.make("Pendulum-v1"), delay, action_delay, receiver=receiver)
+    actions = np.random.default_rng(0).uniform(-2, 2, (30, 1)).astype(np.float32)
+    env.reset(seed=3)
+    for action in actions[:7]:
+        env.step(action)
+    twin, shown = copied(env), []
+    for one in (env, twin):
+        rows = [one.step(action)[0] for action in actions]
+        rows += [one.reset()[0], *(one.step(action)[0] for action in actions)]  # of the next episode, too
+        shown.append({key: np.stack([row[key] for row in rows]) for key in rows[0]})
+    for key in shown[0]:
+        np.testing.assert_array_equal(shown[0][key], shown[1][key], err_msg=key)
 
 
 def test_a_process_can_be_shared():
