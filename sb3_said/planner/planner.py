@@ -287,10 +287,10 @@ class InpaintingPlanner(nn.Module):
         else:
             plan = self._inpaint(steps, value_fn, shortest, longest > shortest, *inputs)
         if plan.values.isnan().any() | ~plan.action.isfinite().all():
-            raise ValueError(
-                "value_fn returned NaN or infinity, or -inf for all, so that no candidate is the best; check the "
-                f"critic, and the observations, the largest of which is {observation.abs().max():.3g}."
-            )
+            found = "The planner's candidates are not finite; check its weights"
+            if plan.actions.isfinite().all() and plan.states.isfinite().all():
+                found = "value_fn returned NaN or infinity, or -inf for all, so that no candidate is the best; check it"
+            raise ValueError(f"{found}, and the observations, the largest of which is {observation.abs().max():.3g}.")
         return plan
 
     @th.no_grad()
