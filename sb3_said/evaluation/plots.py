@@ -73,6 +73,11 @@ def save(ax: Axes, path: str | Path) -> None:
     ax.get_figure(root=True).savefig(path)  # type: ignore[union-attr]  # all axes of `panels` have one
 
 
+def evaluation_files(run: Path) -> list[Path]:
+    """Return where a run keeps the evaluations of training, of a SAID run's expert first; not all need be there."""
+    return [run / "expert" / "evaluations.npz", run / "evaluations.npz"]
+
+
 def plot_learning_curve(run: str | Path, ax: Axes | None = None, window: int = 20) -> Axes:
     """Plot the returns of training, and of the evaluations beside it, over environment steps.
 
@@ -86,7 +91,7 @@ def plot_learning_curve(run: str | Path, ax: Axes | None = None, window: int = 2
     """
     run = Path(run)
     steps, returns = _read_monitors(sorted(run.glob("*monitor.csv")))
-    files = [run / "expert" / "evaluations.npz", run / "evaluations.npz"]
+    files = evaluation_files(run)
     if not len(steps) and not any(file.is_file() for file in files):
         raise ValueError(f"{run} holds neither episodes in *.monitor.csv nor evaluations.npz; give a training run.")
     ax = panels()[0] if ax is None else ax

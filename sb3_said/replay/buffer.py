@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,8 @@ from sb3_said.delays.space import EXECUTED, UNDELAYED, WRAPPER_ORDER, check_spac
 from sb3_said.replay.checks import check_finite, check_order, true_states
 from sb3_said.replay.stored import ROW_ARRAYS, check_stored
 from sb3_said.replay.windows import Windows, WindowSource
+
+UNCHANGED = 1e-3  # of [-1, 1]: what a wrapper's arithmetic in float32 may be off by
 
 
 class DelayedReplayBuffer(ReplayBuffer):
@@ -88,6 +91,7 @@ class DelayedReplayBuffer(ReplayBuffer):
         self._next_states = np.zeros((n_envs, state_space.shape[0]), np.float32)
         self._next_ages = np.zeros(n_envs, np.int16)
         self._expected: dict[str, np.ndarray] | None = None
+        self._has_warned_of_actions = False
 
     # ------------------------------------------------------------------------------------------------ writing
 
@@ -141,6 +145,7 @@ class DelayedReplayBuffer(ReplayBuffer):
         self.ages[row] = obs["delay"].reshape(self.n_envs) if self.is_delayed else 0
         sent = next_obs["action_history"][:, -1] if self.max_delay > 0 else action
         self.actions[row] = sent.reshape(self.n_envs, self.action_dim)
+        self._check_sent(self.actions[row], action)
         if self.is_delayed:  # else the name is the task's own
             for i, info in enumerate(infos):
                 if EXECUTED in info:
@@ -182,6 +187,17 @@ class DelayedReplayBuffer(ReplayBuffer):
         """Tell for each environment whether ``obs`` can be the first of an episode: (n_envs,) bool."""
         past = (obs[key].reshape(self.n_envs, -1) for key in ("delay", "action_history"))
         return np.logical_and.reduce([np.all(part == 0, axis=1) for part in past])
+
+    def _check_sent(self, sent: np.ndarray, action: np.ndarray) -> None:
+        """Warn, once, where histories have other actions than were sent; both (n_envs, act_dim)."""
+        off = float(np.abs(sent - np.reshape(action, sent.shape)).max())
+        if off > UNCHANGED and not self._has_warned_of_actions:
+            self._has_warned_of_actions = True
+            warnings.warn(
+                "A wrapper around DelayedObservationWrapper changes actions on their way: the history has others than "
+                f"the agent sends, by up to {off:.3g} of [-1, 1]. {WRAPPER_ORDER}",
+                stacklevel=3,
+            )
 
     def _check_shown(
         self, next_obs: dict[str, np.ndarray], states: np.ndarray, next_states: np.ndarray, is_state: np.ndarray

@@ -33,8 +33,6 @@ from sb3_said.files.archive import load_tree, readable, save_tree
 from sb3_said.replay.buffer import DelayedReplayBuffer
 from sb3_said.sac.policies import DelayedSACPolicy, as_array
 
-UNCHANGED = 1e-3  # of [-1, 1]: what a wrapper's arithmetic in float32 may be off by
-
 
 class DelayedSAC(SafeSaveMixin, SAC):
     """SAC whose actor knows the actions sent since and whose critics know the true state (SADR).
@@ -96,7 +94,6 @@ class DelayedSAC(SafeSaveMixin, SAC):
                 f"DelayedSAC learns from one-step targets, got n_steps={sac_kwargs['n_steps']}; leave it 1."
             )
         self.trained_ages: list[int] | None = None  # amid episodes, in the latest call of learn()
-        self._has_warned_of_actions = False
         self.augment_state = augment_state
         self.delay_reconciled_critic = delay_reconciled_critic
         self.relabelled_ages = relabelled_ages
@@ -211,27 +208,9 @@ class DelayedSAC(SafeSaveMixin, SAC):
             self._begin_episodes()
         return super()._sample_action(*args, **kwargs)
 
-    def _store_transition(
-        self,
-        replay_buffer: Any,
-        buffer_action: np.ndarray,
-        new_obs: Any,
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        if self._last_obs is None:  # a callback has played at this very step, whose observation is gone
-            return
-        if self.policy.max_delay > 0 and not self._has_warned_of_actions:
-            off = np.abs(new_obs["action_history"][:, -1] - buffer_action)[~dones]  # (n, act_dim)
-            if off.max(initial=0.0) > UNCHANGED:
-                self._has_warned_of_actions = True
-                warnings.warn(
-                    "A wrapper around DelayedObservationWrapper changes actions on their way: the history has others "
-                    f"than the agent sends, by up to {off.max():.3g} of [-1, 1]. {WRAPPER_ORDER}",
-                    stacklevel=5,
-                )
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+    def _store_transition(self, *args: Any, **kwargs: Any) -> None:
+        if self._last_obs is not None:  # else a callback has played at this very step, whose observation is gone
+            super()._store_transition(*args, **kwargs)
 
     def _begin_episodes(self) -> None:
         """Reset the environments, as SB3 does where learning begins."""

@@ -170,13 +170,13 @@ def main(argv: list[str] | None = None) -> None:
         if args.steps < len(shares):
             raise ValueError(f"--steps is {args.steps}, fewer than there are shares, {len(shares)}.")
         parts: list[list[Episode]] = []
-        used: dict[tuple[str, float], int] = {}  # reset seeds, of each agent at a noise level
+        unused: dict[tuple[str, float], int] = {}  # the next reset seed of each agent at a noise level
         with tqdm(total=args.steps, unit="step") as bar:
             for i, share in enumerate(shares):
                 n_steps = args.steps * (i + 1) // len(shares) - args.steps * i // len(shares)
-                first = args.seed + used.get((share.name, share.noise), 0)  # else the same steps came again
+                first = unused.get((share.name, share.noise), args.seed)  # else the same steps came again
                 parts.append(play(share, n_steps, first, args.n_envs, not args.stochastic, bar))
-                used[share.name, share.noise] = 1 + max(episode.seed for episode in parts[-1]) - args.seed
+                unused[share.name, share.noise] = 1 + max(episode.seed for episode in parts[-1])
         run = shares[0].run
         told = [describe(share, part, run.info["env"]) for share, part in zip(shares, parts, strict=True)]
         about = json.dumps({**origin(run), "seed": args.seed, "shares": told})

@@ -189,7 +189,7 @@ def draw(path: Path, summaries: list[Summary], folder: Path, title: str) -> None
     """
     drawings: list[Any] = [partial(plots.plot_returns, summaries)]
     has_episodes = any(len(file.read_text().splitlines()) > 2 for file in folder.glob("*monitor.csv"))
-    if has_episodes or any(folder.glob("**/evaluations.npz")):
+    if has_episodes or any(file.is_file() for file in plots.evaluation_files(folder)):
         drawings.append(partial(plots.plot_learning_curve, folder))
     headers = [path.read_text().split("\n", 1)[0] for path in folder.glob("progress*.csv")]
     drawings += [

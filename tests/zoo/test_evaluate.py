@@ -20,7 +20,7 @@ from small_run import ENV, TINY_PLANNER, write_run
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
-from sb3_said.evaluation import rollout
+from sb3_said.evaluation import Summary, rollout
 from sb3_said.files.normalization import normalization_file, save_normalization
 from sb3_said.zoo import enjoy, evaluate
 from sb3_said.zoo.record import Record
@@ -191,6 +191,15 @@ def test_a_place_that_cannot_be_written_is_told_before_any_episode(run: Path, mo
     with pytest.raises(SystemExit) as exit_info:
         evaluate.main([str(run), "--json", str(run / "run.json" / "numbers.json")])
     assert exit_info.value.code == 1
+
+
+def test_the_curves_of_runs_below_a_folder_are_not_its_own(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    (tmp_path / "another" / "run").mkdir(parents=True)
+    np.savez(tmp_path / "another" / "run" / "evaluations.npz", timesteps=[1], results=[[1.0]])
+    summary = Summary.from_episodes("planner", np.ones(3), np.ones(3, np.int64))
+    evaluate.draw(tmp_path / "x.png", [summary], tmp_path, "a bare file")
+    assert (tmp_path / "x.png").is_file()
 
 
 def test_paths_that_hold_no_agent(run: Path, tmp_path: Path) -> None:
