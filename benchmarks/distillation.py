@@ -42,7 +42,7 @@ def play(model: SAID, args: argparse.Namespace) -> dict[str, Any]:
     if args.onnx and model.policy.who_answers == "student":
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "student.onnx"
-            export(model.policy, file)
+            export(model, file)
             found["onnx"] = vars(measure_latency(OnnxModel(file), met, args.calls))
     return found
 

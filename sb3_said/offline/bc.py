@@ -16,7 +16,7 @@ class BC(OfflineAlgorithm):
     """Imitate the actions of a dataset from what is seen under delay: [observation, action history, age].
 
     The plainest answer to a delay, and a bar for every other: the actor of ``DelayedSAC``, whose mean learns to be the
-    logged action by least squares. Its critics are not trained.
+    logged action by least squares. Its critics are not trained, nor how its actions spread: it answers with the mean.
 
     :param policy: ``"MultiInputPolicy"`` or ``"MlpPolicy"``, which name the same class
     :param env: a task in a ``DelayedObservationWrapper``, or one with a 1-D Box observation (delay 0)
@@ -46,6 +46,16 @@ class BC(OfflineAlgorithm):
         if self.policy.state_normalizer is not None:
             states = self.replay_buffer.window_source(env=self._vec_normalize_env).start_states()  # (N, obs_dim)
             self.policy.state_normalizer.fit(states.to(self.device), 0)
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = True,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Answer as SB3's ``predict`` does, always with the mean: ``deterministic=False`` changes nothing."""
+        return super().predict(observation, state, episode_start, deterministic=True)
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
         """Make gradient steps on batches of the replay buffer."""

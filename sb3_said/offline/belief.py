@@ -45,7 +45,7 @@ class PlannerBelief:
 
     def __init__(self, planner: InpaintingPlanner, which: str = "inpainted"):
         self.planner, self.max_delay = copy.copy(planner), planner.max_delay  # the same weights, other settings
-        self.planner.config = replace(planner.config, present=which)
+        self.planner.config = replace(planner.config, present=which, decided_by="plan")  # it decides nothing
 
     def present(self, state: th.Tensor, action_history: th.Tensor, delay: th.Tensor) -> th.Tensor:
         """Return the one present that no initial noise leads to, or that is guessed: (B, obs_dim)."""

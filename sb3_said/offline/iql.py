@@ -18,6 +18,8 @@ from sb3_said.offline.datasets import Dataset
 from sb3_said.planner.checks import check_same
 from sb3_said.planner.plain import ZScored
 
+SMALLEST_SPREAD = 0.1  # of returns, in the size of the largest: else a log of equal ones would be scaled without end
+
 
 class Transitions(NamedTuple):
     """A batch of B steps of a task without delay, in environment units."""
@@ -87,10 +89,10 @@ class ImplicitValues(ZScored):
         :param states: (M, obs_dim)
         :param returns: (n_trajectories,)
         :param longest: T, steps of the longest trajectory. Rewards are multiplied by T / (largest - smallest return),
-            which is IQL's 1000 / (...) on MuJoCo
+            which is IQL's 1000 / (...) on MuJoCo; the difference counts as a tenth of the largest return at least
         """
         self.scale_to(states)
-        spread = returns.max() - returns.min()
+        spread = th.maximum(returns.max() - returns.min(), SMALLEST_SPREAD * returns.abs().max())
         self.scale.copy_(longest / spread if spread > 0 else th.ones(()))
 
     def value(self, states: th.Tensor) -> th.Tensor:

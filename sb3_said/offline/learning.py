@@ -55,7 +55,8 @@ class OfflineAlgorithm(DelayedSAC):
                 "The agent collects steps of its own now: its replay no longer holds the dataset.", stacklevel=3
             )
             self.replay_buffer, self._replays_logs = self._new_replay_buffer(), False
-        if self._n_updates == 0 and self.replay_buffer.size() == 0:  # what was counted are updates of learn_offline
+            self.num_timesteps = 0  # counted updates of learn_offline
+        elif self._n_updates == 0 and self.replay_buffer.size() == 0:  # as of one that was saved since
             self.num_timesteps = 0
         return super().learn(*args, **kwargs)
 

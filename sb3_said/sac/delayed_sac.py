@@ -183,10 +183,10 @@ class DelayedSAC(SafeSaveMixin, SAC):
         return learn
 
     def _are_at(self, obs: np.ndarray | dict[str, np.ndarray]) -> bool:
-        """Tell whether the environments handed out these observations last; those without delay do not say."""
+        """Tell whether the environments handed out these observations last; those without delay cannot say."""
         assert self.env is not None
         if not isinstance(obs, dict) or not self.env.has_attr("handed_out"):
-            return True
+            return False
         last = self.env.get_attr("handed_out")
         return all(np.array_equal(obs[key][i], part) for i, parts in enumerate(last) for key, part in parts.items())
 

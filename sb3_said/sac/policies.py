@@ -306,9 +306,12 @@ def settings_of(cls: Any, given: dict[str, Any] | None, whose: str) -> Any:
     :param cls: a dataclass
     :param given: some of its fields; None for none
     :param whose: settings they are, for the error
-    :raises ValueError: for a field that it does not have, and as the class does
+    :raises ValueError: for what is no dict, for a field that it does not have, and as the class does
     """
-    names, given = [field.name for field in fields(cls)], given or {}
+    names = [field.name for field in fields(cls)]
+    if not isinstance(given, dict | None):
+        raise ValueError(f'{whose}\'s settings are a dict, such as {{"{names[0]}": ...}}, got {given!r}.')
+    given = given or {}
     if unknown := sorted(set(given) - set(names)):
         raise ValueError(f"{whose} has no setting {', '.join(unknown)}; it has {', '.join(names)}.")
     return cls(**given)

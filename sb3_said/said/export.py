@@ -12,28 +12,28 @@ from torch import nn
 
 from sb3_said.delays.space import KEYS, check_spaces
 from sb3_said.files.atomic import replacing
-from sb3_said.said.policies import SAIDPolicy
+from sb3_said.said.said import SAID
 
 OPSET, IR_VERSION = 17, 8  # of 2022, so that old runtimes read it
 
 
-def to_onnx(policy: SAIDPolicy) -> Any:
-    """Return a policy's student as an ``onnx.ModelProto`` that answers as ``predict`` does.
+def to_onnx(model: SAID) -> Any:
+    """Return an agent's student as an ``onnx.ModelProto`` that answers as ``predict`` does.
 
     Its inputs are the keys of a delayed observation, float32: ``observation`` (B, obs_dim), ``action_history``
     (B, D, act_dim) and ``delay`` (B, 1); ``observation`` alone where the agent's task has no delay. Its output is
-    ``action`` (B, act_dim), in the units of the action space. The metadata have ``max_delay``, and the bounds of
-    actions, which the history is scaled by.
+    ``action`` (B, act_dim), in the units of the action space. The metadata have ``max_delay``, the bounds of actions,
+    which the history is scaled by, and whether observations are those that ``VecNormalize`` has normalised.
 
     :raises ImportError: without the package onnx
-    :raises ValueError: for a policy without a student
+    :raises ValueError: for an agent without a student
     """
     try:
         import onnx
         from onnx import TensorProto, helper, numpy_helper
     except ImportError as error:
         raise ImportError('onnx is missing, which export needs: pip install "sb3_said[export]"') from error
-    student = policy.student
+    policy, student = model.policy, model.policy.student
     if student is None:
         raise ValueError("This agent has no student to export; call distill() first, and save it.")
     state_space, space, max_delay = check_spaces(policy.observation_space, policy.action_space)
@@ -82,17 +82,18 @@ def to_onnx(policy: SAIDPolicy) -> Any:
     graph = helper.make_graph(nodes, "student", inputs, outputs, constants)
     made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
     bounds = {"action_low": json.dumps(low.tolist()), "action_high": json.dumps(high.tolist())}
-    helper.set_model_props(made, {"max_delay": str(max_delay), **bounds})
+    told = {"max_delay": str(max_delay), "reads_normalized": json.dumps(model.reads_normalized)}
+    helper.set_model_props(made, told | bounds)
     onnx.checker.check_model(made)
     return made
 
 
-def export(policy: SAIDPolicy, path: str | os.PathLike[str]) -> None:
+def export(model: SAID, path: str | os.PathLike[str]) -> None:
     """Write :func:`to_onnx`'s graph to a file.
 
     :raises ImportError: without the package onnx
-    :raises ValueError: for a policy without a student
+    :raises ValueError: for an agent without a student
     """
-    made = to_onnx(policy)
+    made = to_onnx(model)
     with replacing(path) as file:
         file.write(made.SerializeToString())

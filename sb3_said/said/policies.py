@@ -328,14 +328,14 @@ class SAIDPolicy(DelayedSACPolicy):
         ``"both"`` answer and the expert decides, or its actor on the guessed present, the planner still plans what
         follows.
 
-        :param observation: (B, ...), as of ``predict``
+        :param observation: (B, ...), as of ``predict``; one alone is a batch of one
         :return: (B, K, act_dim), in the units of the action space. K is the planner's ``horizon``; 1 where the planner
             does not answer
         :raises ValueError: as ``predict``
         """
         who = self.who_answers
         if who not in ("planner", "both"):
-            return self.predict(observation, deterministic=deterministic)[0][:, None]
+            return np.atleast_2d(self.predict(observation, deterministic=deterministic)[0])[:, None]
         self.set_training_mode(False)
         config, planned = self.planner.config, []
         for row in rows_of(self.obs_to_tensor(observation)[0]):

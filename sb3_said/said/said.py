@@ -212,7 +212,12 @@ class SAID(OfflineAlgorithm, StableSAC):
         self.policy.planner.config = replace(self.policy.planner.config, **settings)
 
     def set_answer(self, who: Answer, expert_up_to: int | None = None, expert_from: int | None = None) -> None:
-        """Let one of them answer ``predict`` from now on, or two: see :meth:`SAIDPolicy.set_answer`."""
+        """Let one of them answer ``predict`` from now on, or two: see :meth:`SAIDPolicy.set_answer`.
+
+        :raises ValueError: as it does, and for an expert that has learned nothing, where the planner has
+        """
+        if who in ("expert", "both") and self._n_updates == 0 and self.policy.planner_is_trained:
+            raise ValueError(f"The expert has learned nothing, as this agent learned from logs alone: got {who!r}.")
         self.policy.set_answer(who, expert_up_to, expert_from)
 
     def check_ages(self, ages: list[int]) -> None:
@@ -280,7 +285,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         :raises ValueError: when the buffer is empty, as it is after ``load``
         """
         steps = self.planner_gradient_steps if gradient_steps is None else _count("gradient_steps", gradient_steps)
-        replay, newest, env = self.replay_buffer, self.planner_newest_fraction, self._vec_normalize_env
+        replay, newest, env = self.replay_buffer, self.newest_fraction, self._vec_normalize_env
         source = replay.window_source(newest, env)
         has_older = len(source) < replay.size() * replay.n_envs  # a log's replay has one, whatever the agent has
         bootstrap = self._stored_values if self._n_updates > 0 else None  # offline there are no critics
@@ -293,6 +298,11 @@ class SAID(OfflineAlgorithm, StableSAC):
             seed=self.seed or 0,
             older=replay.window_source(newest, env, older=True) if has_older else None,
         )
+
+    @property
+    def newest_fraction(self) -> float:
+        """The part of the replay that is imitated: all of a log, no step of which is newer than another."""
+        return 1.0 if self._replays_logs else self.planner_newest_fraction
 
     @th.no_grad()
     def _stored_values(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
@@ -419,7 +429,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         with self._as_before_if_it_fails():
             self.planner_ways = ways_of(self.planner_ways, self.planner_kwargs, "iql")
             watcher = self._begin_offline(dataset, total, callback, tb_log_name, True, progress_bar)
-            self.value, self.planner_newest_fraction = "iql", 1.0  # no step of a log is newer than another
+            self.value = "iql"
             self.policy.set_value("iql")
             trainer, values = self.make_planner_trainer(total), self._make_value_trainer()
             intervals = log_interval, eval_interval, save_interval
@@ -450,7 +460,7 @@ class SAID(OfflineAlgorithm, StableSAC):
     @contextmanager
     def _as_before_if_it_fails(self) -> Iterator[None]:
         """Take back what a training from logs changes before its first update, if it gets no further."""
-        names = "planner_ways", "replay_buffer", "_replays_logs", "num_timesteps", "value", "planner_newest_fraction"
+        names = "planner_ways", "replay_buffer", "_replays_logs", "num_timesteps", "value"
         before, policy = {name: getattr(self, name) for name in names}, self.policy
         values, config = policy.values, policy.planner.config
         try:

@@ -184,7 +184,7 @@ def _labelled(model: SAID, parts: dict[str, th.Tensor], presents: th.Tensor) -> 
 def _replayed(model: SAID, config: Distillation, generator: th.Generator) -> _Rows:
     """Label observations of the replay, seen at ages that the planner plans at."""
     planner, n, max_delay = model.policy.planner, LABELLED_AT_ONCE, model.policy.max_delay
-    source = model.replay_buffer.window_source(model.planner_newest_fraction, model.get_vec_normalize_env())
+    source = model.replay_buffer.window_source(model.newest_fraction, model.get_vec_normalize_env())
     windows = source.sample(n, max_delay + 1, generator, planner.config.early_probability)
     ages = th.full((n,), max_delay)
     if planner.config.mask != "fixed":

@@ -57,7 +57,7 @@ class DepthPlanners:
         """Return what decides a planner's weights, in JSON types."""
         return {
             "gradient_steps": self.gradient_steps,
-            "newest_fraction": self.model.planner_newest_fraction,
+            "newest_fraction": self.model.newest_fraction,
             "terminal_penalty": self.model.planner_terminal_penalty,
             "training_seed": self.model.seed or 0,
             "trained_steps": self.model.num_timesteps,

@@ -26,7 +26,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("output", type=Path, metavar="ONNX", help="file to write")
     args = parser.parse_args(argv)
     with explained(parser):
-        export(load_said(args.agent).policy, args.output)
+        export(load_said(args.agent), args.output)
         statistics = find_normalization(*find_agent(args.agent))
     print(f"Wrote {args.output}")
     if statistics is not None:

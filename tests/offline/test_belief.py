@@ -94,6 +94,9 @@ def test_a_planners_belief_repeats_and_keeps_what_is_known():
     th.testing.assert_close(belief.present(state, history, delay), present, rtol=0, atol=0)
     th.testing.assert_close(present[0], state[0])  # nothing is hidden at age 0
     guessed = PlannerBelief(planner, "guessed").present(state, history, delay)
+    planner.config = replace(planner.config, present="guessed", decided_by="actor")
+    th.testing.assert_close(PlannerBelief(planner).present(state, history, delay), present, rtol=0, atol=0)
+    planner.config = replace(planner.config, present="inpainted", decided_by="plan")
     plan = planner.plan(state, history, delay, n_candidates=1, temperature=0.0)  # as it was set before
     th.testing.assert_close(present, plan.states[th.arange(6), 0, delay])
     assert th.equal(guessed[0], state[0]) and (guessed[delay > 0] - present[delay > 0]).abs().min(1).values.max() > 1e-3

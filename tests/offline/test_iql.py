@@ -85,6 +85,18 @@ def test_rewards_are_scaled_by_the_longest_trajectory_over_the_spread_of_returns
     assert IQL(ImplicitValues(5, 1, IQLConfig(hidden=8)), data, 0.9).values.scale == 3 / 4
 
 
+def test_values_of_nearly_equal_returns_are_found_too():
+    """Each step returns 1, but for a thousandth: V is 1 / (1 - gamma) from any start, far from the ends."""
+    rng = np.random.default_rng(0)
+    ends = np.tile(np.arange(20) == 19, 3)
+    rewards = 1.0 + 1e-3 * rng.normal(size=60)
+    data = dataset(rng.normal(size=(60, 2)), np.zeros((60, 1)), rewards, np.zeros(60), ends, rng.normal(size=(3, 2)))
+    values = train(data, 400, gamma=0.5, expectile=0.5, target_rate=0.1)
+    assert values.scale == pytest.approx(20 / (0.1 * 20), rel=0.01)
+    with th.no_grad():
+        np.testing.assert_allclose(values.value(th.from_numpy(data.states)), 2.0, atol=0.2)
+
+
 @pytest.mark.parametrize("terminates", [True, False])
 def test_values_reach_back_through_time_and_end_with_the_task_alone(terminates):
     """s0 -> s1 -> s2, 1 a step: 1 + 0.9 + 0.81 at s0, if the task ends; else s2 leads to itself, and all are 10."""

@@ -107,8 +107,7 @@ def test_learning_goes_on_where_the_replay_has_not_seen_the_episode(make_env, no
     rows = record(loaded, monkeypatch)
     loaded.learn(30, reset_num_timesteps=False)
     assert loaded.num_timesteps == 50 and len(rows) == 30
-    if make_env is not Drift:  # where nothing is delayed, force_reset=False is the caller's promise, as in SB3
-        assert_replay_is_what_happened(loaded, rows)
+    assert_replay_is_what_happened(loaded, rows)
 
 
 @pytest.mark.parametrize("make_env", [Drift, lambda: delayed(4)], ids=["plain", "4"])
@@ -133,7 +132,9 @@ def normalized():
     return VecNormalize(make_vec_env(lambda: delayed(4), n_envs=1), norm_obs_keys=["observation"])
 
 
-@pytest.mark.parametrize("make_env", [lambda: delayed(4), lambda: delayed(0), normalized], ids=["4", "0", "normalised"])
+@pytest.mark.parametrize(
+    "make_env", [Drift, lambda: delayed(4), lambda: delayed(0), normalized], ids=["plain", "4", "0", "normalised"]
+)
 @pytest.mark.parametrize("n_episodes", [1, 2])
 def test_the_environment_may_be_played_between_two_calls(make_env, n_episodes, monkeypatch):
     model = make(make_env())

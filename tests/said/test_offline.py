@@ -95,10 +95,12 @@ def test_no_other_settings_of_v_are_taken():
         make(iql_kwargs={"expectile": 0.3})
 
 
-def test_all_of_a_log_is_learned_from():
+def test_all_of_a_log_is_learned_from_and_then_the_newest_part_of_its_own_steps_again():
     model = learn(make(planner_newest_fraction=0.2), steps=1)
     assert len(model.make_planner_trainer(1).source) > 0.9 * len(log())
-    assert model.planner_newest_fraction == 1.0
+    with pytest.warns(UserWarning, match="no longer holds the dataset"):
+        model.learn(60)
+    assert 0.9 * 12 < len(model.make_planner_trainer(1).source) <= 12
 
 
 def test_candidates_are_scored_by_v_alone(learned, monkeypatch):
@@ -158,6 +160,14 @@ def test_after_logs_it_learns_online_from_steps_of_its_own(n_envs):
     assert model.learn(20, reset_num_timesteps=False).replay_buffer.size() * n_envs == 80
 
 
+def test_an_expert_that_has_learned_nothing_is_not_let_answer():
+    model = learn()
+    for kwargs in ({"who": "expert"}, {"who": "both", "expert_up_to": 1}):
+        with pytest.raises(ValueError, match="The expert has learned nothing"):
+            model.set_answer(**kwargs)
+    assert model.policy.who_answers == "planner"
+
+
 @pytest.mark.parametrize("is_loaded", [False, True])
 def test_steps_that_follow_updates_are_counted_from_the_first(is_loaded, tmp_path):
     """Else states would be scaled by the first one, and no step be taken at random."""
@@ -171,6 +181,10 @@ def test_steps_that_follow_updates_are_counted_from_the_first(is_loaded, tmp_pat
     assert model.num_timesteps == 30 and model._n_updates == 30 - 20  # learning_starts
     normalizer = model.policy.state_normalizer
     assert normalizer.fitted_at > 20 and (normalizer.deviation > 0.1).all()
+    learn(model, steps=40)  # once more, by one that has an expert now
+    with pytest.warns(UserWarning, match="no longer holds the dataset"):
+        model.learn(25, reset_num_timesteps=False)
+    assert model.num_timesteps == 25 and model._n_updates == 10 + 5
 
 
 def test_other_logs_are_not_gone_on_with(tmp_path):

@@ -9,8 +9,9 @@ from gymnasium import spaces
 from small_agent import make, observe
 from small_task import Drift, delayed
 from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_said.realtime import OnnxModel
+from sb3_said.realtime import ControlLoop, OnnxModel
 from sb3_said.said.export import export
 
 onnx = pytest.importorskip("onnx")
@@ -36,7 +37,7 @@ def test_it_answers_as_the_agent(max_delay, tmp_path):
     student.scale_to(student.read(model.policy.obs_to_tensor(obs)[0]))
     for layer in student.network[::2]:
         layer.weight.data *= 2
-    export(model.policy, tmp_path / "agent.onnx")
+    export(model, tmp_path / "agent.onnx")
     loaded = OnnxModel(tmp_path / "agent.onnx")
     with model.policy.answering("student"):
         wanted = model.predict(obs, deterministic=True)[0]
@@ -46,10 +47,18 @@ def test_it_answers_as_the_agent(max_delay, tmp_path):
     assert loaded.observation_space == model.observation_space
 
 
+def test_it_tells_that_it_reads_normalised_observations(tmp_path):
+    model = make(VecNormalize(DummyVecEnv([delayed]), norm_obs_keys=["observation"]))
+    model.policy.make_student(16)
+    export(model, tmp_path / "agent.onnx")
+    with pytest.raises(ValueError, match=r"give normalize=venv\.normalize_obs"):
+        ControlLoop(OnnxModel(tmp_path / "agent.onnx"), 1)
+
+
 def test_an_answer_that_is_not_finite_is_refused(tmp_path):
     model = make()
     model.policy.make_student(16)
-    export(model.policy, tmp_path / "agent.onnx")
+    export(model, tmp_path / "agent.onnx")
     obs = observe()
     obs["observation"][3] = np.nan
     with pytest.raises(ValueError, match="not finite; look at the observation"):
@@ -59,7 +68,7 @@ def test_an_answer_that_is_not_finite_is_refused(tmp_path):
 def test_a_file_of_another_program_is_told(tmp_path):
     model = make()
     model.policy.make_student(16)
-    export(model.policy, tmp_path / "agent.onnx")
+    export(model, tmp_path / "agent.onnx")
     graph = onnx.load(tmp_path / "agent.onnx")
     del graph.metadata_props[:]
     onnx.save(graph, tmp_path / "other.onnx")
@@ -74,7 +83,7 @@ def test_a_file_of_another_program_is_told(tmp_path):
 def test_a_loop_runs_it_without_pytorch(tmp_path):
     model = make()
     model.policy.make_student(16)
-    export(model.policy, tmp_path / "agent.onnx")
+    export(model, tmp_path / "agent.onnx")
     code = f"""
 import sys, numpy as np
 from sb3_said.realtime import ControlLoop, OnnxModel
@@ -90,5 +99,5 @@ print(loop.act(0)[0], *{{"torch", "stable_baselines3"}} & sys.modules.keys())
 
 def test_without_a_student_there_is_nothing_to_export(tmp_path):
     with pytest.raises(ValueError, match=r"no student to export; call distill\(\)"):
-        export(make().policy, tmp_path / "agent.onnx")
+        export(make(), tmp_path / "agent.onnx")
     assert not any(tmp_path.iterdir())

@@ -408,6 +408,7 @@ def test_of_both_the_expert_answers_young_observations_and_the_planner_old_ones(
     for who in ("planner", "expert"):
         with model.policy.answering(who):
             answers[who] = answer(model, obs), model.predict_plan(obs, deterministic=True)
+            np.testing.assert_array_equal(model.predict_plan(rows_of(obs)[0], deterministic=True), answers[who][1][:1])
     model.set_answer("both", expert_up_to=1)
     assert model.policy.who_answers == "both"
     expected = np.where(young[:, None], answers["expert"][0], answers["planner"][0])

@@ -179,6 +179,8 @@ def test_arguments_that_cannot_work_are_refused(kwargs, message):
 def test_an_unknown_setting_is_told_where_no_other_is_given():
     with pytest.raises(ValueError, match="The planner has no setting dept; it has depth"):
         SAID("MlpPolicy", delayed(), planner_kwargs={"dept": 2}, buffer_size=100, device="cpu")
+    with pytest.raises(ValueError, match=r"The planner's settings are a dict.* got PlannerConfig"):
+        SAID("MlpPolicy", delayed(), planner_kwargs=PlannerConfig(), buffer_size=100, device="cpu")
 
 
 def test_counts_may_be_written_as_floats():
