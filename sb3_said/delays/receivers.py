@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections import deque
 from typing import Any
 
@@ -19,7 +20,7 @@ class Draws:
 
     def __init__(self, process: DelayProcess, rng: np.random.Generator):
         self.process, self.rng, self.n_drawn = process, rng, 0
-        self._began = rng.bit_generator.state
+        self._began = copy.deepcopy(rng.bit_generator.__getstate__())  # with the count of its children
         self._delays = packet_delays(process, rng)
 
     def __next__(self) -> int | None:
@@ -31,7 +32,7 @@ class Draws:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        self.rng.bit_generator.state = self._began
+        self.rng.bit_generator.__setstate__(copy.deepcopy(self._began))  # type: ignore[attr-defined]  # as in pickles
         self._delays = packet_delays(self.process, self.rng)
         for _ in range(self.n_drawn):
             next(self._delays)

@@ -67,6 +67,17 @@ def colors(n: int, ordered: bool = False) -> list[str]:
     return [to_hex(color) for color in colormaps["viridis" if ordered else "turbo"](np.linspace(0, 0.9, n))]
 
 
+def check_file(path: str | Path) -> None:
+    """Refuse a file that :func:`save` has no format for, before what it is to show is made.
+
+    :raises ValueError: for its suffix
+    :raises ImportError: without matplotlib
+    """
+    formats = panels()[0].get_figure(root=True).canvas.get_supported_filetypes()  # type: ignore[union-attr]  # as below
+    if Path(path).suffix.removeprefix(".").lower() not in formats:
+        raise ValueError(f"No plot can be written as {path}: give it the suffix .png, .pdf or .svg.")
+
+
 def save(ax: Axes, path: str | Path) -> None:
     """Write the figure of ``ax``; the file's suffix names the format (.png, .pdf, .svg)."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)

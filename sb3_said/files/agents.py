@@ -122,7 +122,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
         :raises SavedFileError: if the file is damaged, foreign, forged, newer than this package or of another class,
             or does not go with the environment or the arguments
         """
-        path = existing(path)
+        path, device = existing(path), get_device(device)  # what torch does not know is no fault of the file
         if print_system_info:
             get_system_info()
             print("Saved with", load_metadata(path)["versions"])

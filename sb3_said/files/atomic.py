@@ -9,6 +9,7 @@ import os
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import IO, Any
 
 try:
@@ -34,8 +35,7 @@ def replacing(target: PathOrFile) -> Iterator[IO[bytes]]:
     if not isinstance(target, (str, os.PathLike)):
         yield target
         return
-    if os.path.isdir(target):
-        raise ValueError(f"Cannot write to {os.fspath(target)}: it is a folder. Give the path of a file.")
+    _refuse_folder(target)
     if os.path.exists(target) and not os.path.isfile(target):
         with open(target, "wb") as file:
             yield file
@@ -62,6 +62,26 @@ def replacing(target: PathOrFile) -> Iterator[IO[bytes]]:
     except OSError as error:
         error.filename = error.filename or str(path)  # that of a full disk has none
         raise
+
+
+def check_writable(target: str | os.PathLike[str]) -> None:
+    """Refuse a target that :func:`replacing` cannot write, before the work whose result it is to hold.
+
+    :param target: where to write; missing folders are made
+    :raises ValueError: if it is a folder
+    :raises OSError: where its folder cannot be written
+    """
+    _refuse_folder(target)
+    if os.path.isfile(target) or not os.path.exists(target):
+        folder = Path(target).parent
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=folder):
+            pass
+
+
+def _refuse_folder(target: str | os.PathLike[str]) -> None:
+    if os.path.isdir(target):
+        raise ValueError(f"Cannot write to {os.fspath(target)}: it is a folder. Give the path of a file.")
 
 
 def remove_abandoned(folder: Path, name: str | None = None) -> None:

@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_said.delays.space import check_spaces, unscale_action
-from sb3_said.files.atomic import replacing
+from sb3_said.files.atomic import check_writable, replacing
 from sb3_said.offline.datasets import Dataset, is_file
 from sb3_said.offline.scores import reference_returns
 from sb3_said.offline.sources import TASK
@@ -24,12 +24,14 @@ def check_target(target: str | os.PathLike[str]) -> None:
     :param target: path of an ``.npz``, or id of a Minari dataset such as ``"hopper/mine-v0"``
     :raises ValueError: for a file of another format, no id of a Minari dataset, and what is there already
     :raises ImportError: without Minari
+    :raises OSError: for a folder that cannot be written
     """
     if is_file(target):
         if Path(target).suffix != ".npz":
             raise ValueError(f"Datasets are written as .npz or into Minari, got {os.fspath(target)}.")
         if Path(target).exists():
             raise ValueError(f"{os.fspath(target)} is there already; give another name, or remove it.")
+        check_writable(target)
         return
     name = os.fspath(target)
     if not name.rpartition("-v")[2].isdigit():

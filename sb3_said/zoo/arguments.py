@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import gymnasium as gym
+import torch as th
 
 from sb3_said.delays.text import age_range, make_process
 
@@ -46,8 +47,10 @@ def add_playing(parser: argparse.ArgumentParser, episodes: int | None, seed: int
         parser.add_argument(
             "--episodes", type=int, default=episodes, help=f"whole episodes to play (default: {episodes})"
         )
-    parser.add_argument("--seed", type=int, default=seed, help=f"reset seed of the first episode (default: {seed})")
-    parser.add_argument("--device", default="auto", help="torch device (default: auto)")
+    parser.add_argument(
+        "--seed", type=reset_seed, default=seed, help=f"reset seed of the first episode (default: {seed})"
+    )
+    parser.add_argument("--device", type=device, default="auto", help="torch device (default: auto)")
     parser.add_argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules to import that "
                         "register the task, beside those that its run remembers")  # fmt: skip
     parser.add_argument("--num-threads", type=int, default=1, help="torch threads: one decision is too small for "
@@ -60,6 +63,23 @@ def add_run(parser: argparse.ArgumentParser, episodes: int) -> None:
     add_delay(parser, default="the trained one; of a .zip without its run folder the largest that it was built for")
     add_playing(parser, episodes)
     parser.add_argument("--stochastic", action="store_true", help="sample actions instead of taking the best")
+
+
+def reset_seed(word: str) -> int:
+    """Return a seed that Gymnasium takes."""
+    if not word.isdecimal():
+        raise argparse.ArgumentTypeError(f"a reset seed is a whole number, 0 or more, got {word}")
+    return int(word)
+
+
+def device(word: str) -> str:
+    """Return the name of a device that torch knows, or ``auto``."""
+    try:
+        if word != "auto":
+            th.device(word)
+    except RuntimeError as error:
+        raise argparse.ArgumentTypeError(f"auto, cpu, cuda or another that torch has, got {word}: {error}") from error
+    return word
 
 
 def check_positive(args: argparse.Namespace, *names: str) -> None:

@@ -13,6 +13,7 @@ from huggingface_hub import EvalResult, ModelCard, ModelCardData
 
 from sb3_said import SAID
 from sb3_said.delays.space import written_ages
+from sb3_said.files.atomic import check_writable
 from sb3_said.zoo.arguments import explained, make_parser
 from sb3_said.zoo.cells import Cell, Results, average
 from sb3_said.zoo.over_delays import digest_of
@@ -53,11 +54,12 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--latency", type=float, metavar="MS", help="median time of a decision, as evaluate printed it")
     parser.add_argument("-o", "--output", type=Path, metavar="MD", help="the card (default: beside the agent, .md)")
     args = parser.parse_args(argv)
+    target = args.output or args.agent.with_suffix(".md")
     with explained(parser):
+        check_writable(target)
         record, results = Record.read(args.run), Results(args.returns, None)
         run = load_run(args.agent, record.algo, record.env, gym_packages=record.gym_packages)
         card = make_card(run, record, results, args.latency, trial_steps(args.run))
-    target = args.output or args.agent.with_suffix(".md")
     card.save(target)
     print(f"Wrote {target}")
 

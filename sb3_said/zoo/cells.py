@@ -173,6 +173,17 @@ def print_table(table: Table, delays: list[int | str]) -> None:
         _print_rows("return under delay", several, columns, stratified_interval)
 
 
+def print_seeds(cells: Iterable[Cell], rows: Mapping[str, str]) -> None:
+    """Print the files behind each row that has several: those that were played under one label, in whichever call.
+
+    :param rows: as of :func:`make_table`
+    """
+    for agent, name in rows.items():
+        files = dict.fromkeys(cell.file for cell in cells if cell.agent == agent and cell.result)
+        if len(files) > 1:
+            print(f"{name}: {len(files)} agents, {', '.join(files)}")
+
+
 def print_scores(table: Table, delays: list[int | str], env_id: str) -> None:
     """Print the table again in D4RL's normalised scores, and nothing for a task that has none."""
     if reference_returns(env_id) is not None:

@@ -65,12 +65,14 @@ class Episode:
     terminated: bool = False
     seed: int = 0
     """of its reset"""
+    is_whole: bool = True
+    """not cut off"""
 
     def cut(self, n_steps: int) -> Episode:
         """Return the first steps of it."""
-        ended = self.terminated and n_steps >= len(self.rewards)
+        is_whole = n_steps >= len(self.rewards)
         kept = self.states[: n_steps + 1], self.actions[:n_steps], self.rewards[:n_steps]
-        return Episode(*kept, ended, self.seed)
+        return Episode(*kept, self.terminated and is_whole, self.seed, is_whole)
 
 
 class Recorder(gym.Wrapper[Any, Any, Any, Any]):
@@ -305,16 +307,13 @@ def join(episodes: list[Episode]) -> Dataset:
 
 
 def describe(share: Share, episodes: list[Episode], env_id: str) -> dict[str, Any]:
-    """Print what a share earned, and return it in JSON types."""
-    returns = [sum(episode.rewards) for episode in episodes]
-    mean = float(np.mean(returns))
-    told = {"agent": share.name, "noise": share.noise, "episodes": len(episodes), "mean_return": mean}
-    score = ""
-    if reference_returns(env_id) is not None:
+    """Print what a share earned in its whole episodes, and return it in JSON types."""
+    returns = [sum(episode.rewards) for episode in episodes if episode.is_whole]
+    mean = float(np.mean(returns)) if returns else None
+    told: dict[str, Any] = {"agent": share.name, "noise": share.noise, "episodes": len(episodes), "mean_return": mean}
+    earned = "none of them whole" if mean is None else f"mean return {mean:,.1f}"
+    if mean is not None and reference_returns(env_id) is not None:
         told["normalized_score"] = float(normalized_score(mean, env_id))
-        score = f", normalised score {told['normalized_score']:.1f}"
-    print(
-        f"{share.name}, noise {share.noise:g}: {len(episodes)} episodes, mean return {mean:,.1f}{score}",
-        file=sys.stderr,
-    )
+        earned += f", normalised score {told['normalized_score']:.1f}"
+    print(f"{share.name}, noise {share.noise:g}: {len(episodes)} episodes, {earned}", file=sys.stderr)
     return told

@@ -8,11 +8,12 @@ from typing import Any
 
 from sb3_said import SAID
 from sb3_said.delays.space import written_ages
+from sb3_said.files.atomic import check_writable
 from sb3_said.files.normalization import normalization_file
 from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.zoo.arguments import TRUST, explained, make_parser
 from sb3_said.zoo.folder import find_agent, find_normalization
-from sb3_said.zoo.runs import ANSWERS
+from sb3_said.zoo.runs import ANSWERS, changes
 
 EPILOG = f"""\
 examples:
@@ -75,11 +76,11 @@ def main(argv: list[str] | None = None) -> None:
     settings: dict[str, Any] = {name: None if value == "none" else value for name, value in given.items()}
     expert_ages = args.expert_up_to, args.expert_from
     sets_answer = args.answer is not None or expert_ages != (None, None)
-    changes = bool(settings) or sets_answer
+    is_changed = bool(settings) or sets_answer
     with explained(parser):
-        if changes and args.output is None:
+        if is_changed and args.output is None:
             raise ValueError("-o is missing: name the file of the agent with its new settings.")
-        if args.output is not None and not (changes or args.compact):
+        if args.output is not None and not (is_changed or args.compact):
             raise ValueError("-o saves an agent with new settings, and none is given: add --temperature, for instance.")
         if args.compact and args.output is None:
             raise ValueError("-o is missing: name the file of the compact agent.")
@@ -87,6 +88,8 @@ def main(argv: list[str] | None = None) -> None:
         model.set_planner(**settings)
         if sets_answer:
             model.set_answer(args.answer or model.policy.who_answers, *expert_ages)
+        if args.output is not None:
+            check_writable(args.output)
     config = model.policy.planner.config
     for name in SAMPLING_SETTINGS:
         print(f"{name:14} {getattr(config, name)}" + "  (new)" * (name in settings))
@@ -101,9 +104,25 @@ def main(argv: list[str] | None = None) -> None:
     who, ages = model.policy.who_answers, written_ages([*model.policy.expert_ages])
     print(f"{'answers':14} {who}{f': the expert at ages {ages}' * (who == 'both')}{'  (new)' * sets_answer}")
     if args.output is not None:
-        keep_normalization(args.agent, args.output)
-        model.save(args.output, compact=args.compact)
-        print(f"Wrote {args.output}")
+        hand_on(model, args.agent, args.output, args.compact)
+
+
+def hand_on(model: SAID, agent: Path, output: Path, compact: bool) -> None:
+    """Save an agent with what belongs to it, and say what of its run the file does not keep.
+
+    :param agent: the run's folder, or the file that it was opened from
+    :param output: where to save it
+    """
+    keep_normalization(agent, output)
+    model.save(output, compact=compact)
+    print(f"Wrote {output}")
+    file, record = find_agent(agent)
+    changed = {} if record is None else changes(record.env_kwargs, record.wrappers)
+    if changed and file.resolve().parent != output.resolve().parent:
+        print(
+            f"Its run changes the task beside its delay, which the file does not keep: {changed}. It plays right in "
+            "its run's folder, or in an environment of yours with these."
+        )
 
 
 def keep_normalization(agent: Path, output: Path) -> None:

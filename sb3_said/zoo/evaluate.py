@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+import argparse
 import math
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import Any
 
 import torch as th
 from tqdm import tqdm
 
 from sb3_said.evaluation import Summary, collect_observations, measure_latency, plots
-from sb3_said.files.atomic import write_json
+from sb3_said.files.atomic import check_writable, write_json
 from sb3_said.offline import normalized_score, reference_returns
 from sb3_said.zoo.answer import BEST_NAME
 from sb3_said.zoo.arguments import TRUST, add_run, check_positive, explained, make_parser, read_delay
@@ -61,30 +61,47 @@ def main(argv: list[str] | None = None) -> None:
                         "the task's own)")  # fmt: skip
     args = parser.parse_args(argv)
     with explained(parser):
-        check_positive(args, "episodes", "n_envs", "num_threads")
-        if args.period is not None and not (args.realtime and args.period > 0):
-            raise ValueError(f"--period takes seconds above 0 and needs --realtime, got {args.period}.")
-        th.set_num_threads(args.num_threads)
-        if args.plot is not None:
-            plots.panels()  # without matplotlib, fail now and not after the episodes
-        delay = 0 if args.realtime and not args.delay else read_delay(args.delay)
-        how_played = args.algo, args.env, delay, args.device, None, args.gym_packages
-        run = load_run(args.run, *how_played)
-        best = run.folder / BEST_NAME
-        runs = {"best" if Path(run.info["file"]) == best else "last": run}
-        if "last" in runs and Path(args.run).is_dir() and best.is_file():
-            runs["best"] = load_run(best, *how_played)
-            if runs["best"].info["trained_steps"] == run.info["trained_steps"]:
-                del runs["best"]  # the last one is the best
-        period: float = args.period or (args.realtime and control_period(run)) or 0.0
-        if args.realtime and not period:
-            raise ValueError(f"{run.info['env']} does not tell how long a control step is: give --period.")
-        name = "realtime.json" if args.realtime else "evaluation.json"
-        target = args.json or run.folder / (name if Path(args.run).is_dir() else f"{Path(args.run).stem}_{name}")
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with TemporaryFile(dir=target.parent):  # where that cannot be written, fail now, too
-            pass
+        measure(args, *opened(args))
 
+
+def opened(args: argparse.Namespace) -> tuple[dict[str, LoadedRun], Path, float]:
+    """Check the options and open the agents, before any episode.
+
+    :return: the last agent and the best, as far as there are two; the file of the numbers; seconds of a control step in
+        real time
+    :raises ValueError: for an option that cannot work
+    """
+    check_positive(args, "episodes", "n_envs", "num_threads")
+    if args.period is not None and not (args.realtime and args.period > 0):
+        raise ValueError(f"--period takes seconds above 0 and needs --realtime, got {args.period}.")
+    th.set_num_threads(args.num_threads)
+    if args.plot is not None:
+        plots.check_file(args.plot)  # what cannot be drawn is told now, and not after the episodes
+    delay = 0 if args.realtime and not args.delay else read_delay(args.delay)
+    how_played = args.algo, args.env, delay, args.device, None, args.gym_packages
+    run = load_run(args.run, *how_played)
+    best = run.folder / BEST_NAME
+    runs = {"best" if Path(run.info["file"]) == best else "last": run}
+    if "last" in runs and Path(args.run).is_dir() and best.is_file():
+        runs["best"] = load_run(best, *how_played)
+        if runs["best"].info["trained_steps"] == run.info["trained_steps"]:
+            del runs["best"]  # the last one is the best
+    period: float = args.period or (args.realtime and control_period(run)) or 0.0
+    if args.realtime and not period:
+        raise ValueError(f"{run.info['env']} does not tell how long a control step is: give --period.")
+    name = "realtime.json" if args.realtime else "evaluation.json"
+    target = args.json or run.folder / (name if Path(args.run).is_dir() else f"{Path(args.run).stem}_{name}")
+    for file in (target, *([args.plot] if args.plot else [])):
+        check_writable(file)
+    return runs, target, period
+
+
+def measure(args: argparse.Namespace, runs: dict[str, LoadedRun], target: Path, period: float) -> None:
+    """Play and time the agents, print a table, and write the numbers.
+
+    :param runs: the last agent, or the best where there is no other, and the best
+    """
+    run = next(iter(runs.values()))
     last_seed = args.seed + args.episodes - 1
     print(f"{run.info['algo']} on {run.info['env']}, delay {run.info['delay']}, reset seeds {args.seed}..{last_seed}")
     settings = {"seed": args.seed, "n_envs": args.n_envs, "deterministic": not args.stochastic}

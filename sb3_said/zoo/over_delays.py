@@ -21,8 +21,9 @@ import torch as th
 from sb3_said.delays import FixedDelay
 from sb3_said.delays.text import age_range, make_process
 from sb3_said.evaluation import Summary, plots
+from sb3_said.files.atomic import check_writable
 from sb3_said.zoo.arguments import TRUST, add_playing, check_positive, explained, make_parser, read_delay
-from sb3_said.zoo.cells import AGE, Cell, Results, make_table, print_manners, print_scores, print_table
+from sb3_said.zoo.cells import AGE, Cell, Results, make_table, print_manners, print_scores, print_seeds, print_table
 from sb3_said.zoo.runs import ANSWERS, LoadedRun, answering, answers, delay_name, load_run, longest_delay, origin
 
 EPILOG = f"""\
@@ -76,8 +77,10 @@ def main(argv: list[str] | None = None) -> None:
         check_positive(args, "episodes", "n_envs", "workers", "num_threads")
         th.set_num_threads(args.num_threads)
         if args.plot is not None:
-            plots.panels()  # without matplotlib, fail now and not after the episodes
+            plots.check_file(args.plot)  # what cannot be drawn is told now, and not after the episodes
+            check_writable(args.plot)
         delays = list(dict.fromkeys(read_name(word) for word in args.delays or ()))
+        check_writable(args.json)
         shown = play_missing(args, delays) if args.runs else known_cells(args.json, delays)
         rows = choose_rows(args.rows, shown)
     table = make_table(shown, rows)
@@ -85,6 +88,7 @@ def main(argv: list[str] | None = None) -> None:
     in_order = sorted(shown, key=lambda cell: (cell.age_error != 0, order.index(cell.delay), cell.age_error))
     columns, settings = list(dict.fromkeys(cell.column for cell in in_order)), Results(args.json).settings
     print_table(table, columns)
+    print_seeds(shown, rows)
     print_scores(table, columns, settings["env"])
     print_manners(shown, rows)
     if args.plot is not None and any(table.values()):

@@ -147,11 +147,20 @@ def load_run(
     info |= {"file": str(file), "trained_steps": model.num_timesteps}
     is_normalized = bool(hyperparams.get("normalize")) or getattr(model, "reads_normalized", False)
     normalize = _load_normalize(file, record, make_env, is_normalized)
-    changes: dict[str, Any] = {"env_kwargs": kwargs} if kwargs else {}
+    return LoadedRun(model, make_env, normalize, file.parent, info, changes(kwargs, wrappers))
+
+
+def changes(env_kwargs: dict[str, Any], wrappers: list[Any]) -> dict[str, Any]:
+    """Return what a run changes in its task but the observation delay, see :class:`LoadedRun`.
+
+    :param env_kwargs: of ``gymnasium.make``
+    :param wrappers: as rl_zoo3's ``env_wrapper`` has them
+    """
+    changed: dict[str, Any] = {"env_kwargs": env_kwargs} if env_kwargs else {}
     for name, given in _named(wrappers):
         is_ours = "DelayedObservationWrapper" in str(name)
-        changes |= {x: given[x] for x in given.keys() - DELAYS} if is_ours else {str(name): given}
-    return LoadedRun(model, make_env, normalize, file.parent, info, changes)
+        changed |= {x: given[x] for x in given.keys() - DELAYS} if is_ours else {str(name): given}
+    return changed
 
 
 def described(file: Path) -> tuple[str | None, str | None]:
@@ -260,6 +269,11 @@ def _check_spaces(model: BaseAlgorithm, env: gym.Env[Any, Any], file: Path) -> N
         expected, given = shapes(getattr(model, what)), shapes(getattr(env, what))
         if expected != given:
             raise ValueError(f"{file} expects {what} shapes {expected}, the task has {given}: check --env and --delay.")
+    if model.action_space != env.action_space:
+        raise ValueError(
+            f"{file} sends actions in {model.action_space}, the task takes {env.action_space}: check --env. An agent "
+            "of a run whose wrapper changes actions plays in that run's folder, which names the wrapper."
+        )
 
 
 def _load_normalize(

@@ -17,12 +17,14 @@ from optuna.storages import BaseStorage, JournalStorage, RDBStorage
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 from optuna.study import MaxTrialsCallback
 from optuna.trial import FrozenTrial, Trial, TrialState
+from sqlalchemy.exc import SQLAlchemyError  # Optuna's data bases are SQLAlchemy's
 
 from sb3_said.planner.checks import check_same
 
 optuna.logging.set_verbosity(optuna.logging.ERROR)
 
 DRAWN = ("temperature", "choice_factor")  # real numbers, which tpe draws between the lowest and the highest
+OWN_STUDY = "study.log"  # in the output folder
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 
 
@@ -145,35 +147,49 @@ def play_trial(
     return mean
 
 
-def open_study(folder: Path, storage: str, name: str, settings: dict[str, Any], prune: float) -> optuna.Study:
+def open_study(
+    folder: Path, storage: str | None, name: str | None, settings: dict[str, Any], prune: float, new_name: str = "said"
+) -> optuna.Study:
     """Open a study, or begin it.
 
     :param folder: shared by the workers, for a lock
-    :param storage: an Optuna RDB URL, or the path of a journal file
+    :param storage: an Optuna RDB URL, or the path of a journal file; by default ``study.log`` in the folder
+    :param name: of the study; by default the one of the folder's own file, whatever the run was named when it began
     :param settings: in JSON types, what all trials must have in common to be compared
     :param prune: p-value below which a trial is pruned; 0 prunes none
-    :raises ValueError: when the study was begun with other settings
+    :param new_name: of a study that begins without a name
+    :raises ValueError: when the study was begun with other settings, or a data base cannot be opened
     """
+    own = str(folder / OWN_STUDY)
     folder.mkdir(parents=True, exist_ok=True)
     with warnings.catch_warnings(), FileLock(folder / "study.lock"):
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         pruner = optuna.pruners.WilcoxonPruner(p_threshold=prune) if prune > 0 else optuna.pruners.NopPruner()
-        if "://" in storage:
-            # SQLite lets one worker write at a time, and tells the others that wait longer than this to give up.
-            patience = {"connect_args": {"timeout": 120}} if storage.startswith("sqlite") else {}
-            backend: BaseStorage = RDBStorage(storage, engine_kwargs=patience)
-        else:
-            Path(storage).parent.mkdir(parents=True, exist_ok=True)
-            # The default lock is a symbolic link, which Windows lets few users make
-            backend = JournalStorage(JournalFileBackend(storage, JournalFileOpenLock(storage)))
+        backend = _open_storage(storage or own)
+        if name is None:
+            known = optuna.get_all_study_names(backend) if storage in (None, own) else []
+            name = known[0] if len(known) == 1 else new_name
         study = optuna.create_study(
             storage=backend, study_name=name, direction="maximize", load_if_exists=True, pruner=pruner
         )
         if "settings" not in study.user_attrs:
             study.set_user_attr("settings", settings)
     advice = "Go on with the old ones, or begin another study with --study-name."
-    check_same(f"Study {name!r} in {storage} was begun", study.user_attrs["settings"], settings, advice)
+    check_same(f"Study {name!r} in {storage or own} was begun", study.user_attrs["settings"], settings, advice)
     return study
+
+
+def _open_storage(storage: str) -> BaseStorage:
+    if "://" not in storage:
+        Path(storage).parent.mkdir(parents=True, exist_ok=True)
+        # The default lock is a symbolic link, which Windows lets few users make
+        return JournalStorage(JournalFileBackend(storage, JournalFileOpenLock(storage)))
+    # SQLite lets one worker write at a time, and tells the others that wait longer than this to give up.
+    patience = {"connect_args": {"timeout": 120}} if storage.startswith("sqlite") else {}
+    try:
+        return RDBStorage(storage, engine_kwargs=patience)
+    except SQLAlchemyError as error:
+        raise ValueError(f"--storage {storage} cannot be opened: {str(error).splitlines()[0]}") from error
 
 
 def finished(study: optuna.Study) -> list[FrozenTrial]:

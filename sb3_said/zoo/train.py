@@ -6,6 +6,7 @@ import argparse
 import os
 import secrets
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import rl_zoo3.train
 
 from sb3_said.offline import OfflineAlgorithm
 from sb3_said.offline.datasets import is_file
-from sb3_said.zoo.arguments import Delay, add_delay, check_positive, explained, make_parser, read_delay
+from sb3_said.zoo.arguments import Delay, add_delay, check_positive, device, explained, make_parser, read_delay
 from sb3_said.zoo.manager import ALGORITHMS, ALGOS, DelayedExperimentManager, Run
 from sb3_said.zoo.offline import OfflineExperimentManager
 from sb3_said.zoo.presets import PRESETS
@@ -36,6 +37,21 @@ Runs go to LOG_FOLDER/ALGO/ENV-delayN-seedS_K (-f sets LOG_FOLDER); sb3-said eva
 folder. Ctrl-C, SIGTERM and SIGHUP write a checkpoint before they end the training; --resume goes on from there.
 Below: the options of rl_zoo3, all of which work here.
 """
+
+
+def budget(word: str) -> int:
+    """Return the number of steps, or rl_zoo3's -1, which leaves it to the preset."""
+    if (not word.isdecimal() and word != "-1") or word.strip("0") == "":
+        raise argparse.ArgumentTypeError(f"steps are a whole number, at least 1; -1 takes the preset's, got {word}")
+    return int(word)
+
+
+#: Options of rl_zoo3 that are read here first: an agent's path from anywhere, and what rl_zoo3 would take for another.
+PASSED_ON: dict[tuple[str, ...], Callable[[str], Any]] = {
+    ("-i", "--trained-agent"): os.path.abspath,
+    ("-n", "--n-timesteps"): budget,
+    ("--device",): device,
+}
 
 
 def own_parser() -> argparse.ArgumentParser:
@@ -71,9 +87,8 @@ def own_parser() -> argparse.ArgumentParser:
         "minutes, and less often the larger the replay is)",
     )  # fmt: skip
     parser.add_argument("--resume", type=Path, metavar="RUN_DIR", help="go on with a run from its last checkpoint")
-    parser.add_argument(
-        "-i", "--trained-agent", type=os.path.abspath, help=argparse.SUPPRESS
-    )  # rl_zoo3's, from anywhere
+    for names, kind in PASSED_ON.items():
+        parser.add_argument(*names, type=kind, help=argparse.SUPPRESS)
     return parser
 
 
@@ -117,7 +132,9 @@ def read_command_line(argv: list[str]) -> tuple[Run, str, list[str]]:
     """
     options, zoo_argv = own_parser().parse_known_args(argv)
     zoo_argv = [*joined_settings(zoo_argv), *(["--help"] if options.help else [])]
-    zoo_argv += [] if options.trained_agent is None else [f"--trained-agent={options.trained_agent}"]
+    for name in (names[-1] for names in PASSED_ON):
+        value = getattr(options, name[2:].replace("-", "_"))
+        zoo_argv += [] if value is None else [f"{name}={value}"]
     if options.num_threads is not None or options.resume is None:  # whose own number stands before
         zoo_argv.append(f"--num-threads={1 if options.num_threads is None else options.num_threads}")
     delay, expert_delay = read_delay(options.delay), read_delay(options.expert_delay)

@@ -21,13 +21,23 @@ from sb3_said.evaluation import Latency, Summary
 from sb3_said.files.atomic import write_json
 from sb3_said.files.checkpoint import CHECKPOINT_NAME
 from sb3_said.planner.config import SAMPLING_SETTINGS
-from sb3_said.zoo.arguments import TRUST, check_positive, explained, make_parser
+from sb3_said.zoo.arguments import TRUST, check_positive, device, explained, make_parser, reset_seed
 from sb3_said.zoo.best import write_best
 from sb3_said.zoo.depths import DepthPlanners
 from sb3_said.zoo.evaluate import evaluate, print_table
 from sb3_said.zoo.record import Record
 from sb3_said.zoo.runs import LoadedRun, answers, load_run, origin
-from sb3_said.zoo.search import DRAWN, describe, find_winner, finished, open_study, returns_of, save_plot, search
+from sb3_said.zoo.search import (
+    DRAWN,
+    OWN_STUDY,
+    describe,
+    find_winner,
+    finished,
+    open_study,
+    returns_of,
+    save_plot,
+    search,
+)
 
 EPILOG = f"""\
 examples:
@@ -78,14 +88,14 @@ def main(argv: list[str] | None = None) -> None:
     add("--round", type=int, default=5, help="episodes played between two decisions on pruning (default: 5)")
     add("--prune", type=float, default=0.05, metavar="P", help="p-value of the paired test below which a trial is "
         "pruned; 0: never (default: 0.05)")  # fmt: skip
-    add("--seed", type=int, default=20_000, help="reset seed of the first episode (default: 20000)")
+    add("--seed", type=reset_seed, default=20_000, help="reset seed of the first episode (default: 20000)")
     add("--report-episodes", type=int, default=50, help="episodes that report the winner and the expert (default: 50)")
-    add("--report-seed", type=int, default=10_000, help="reset seed of the first of them (default: 10000)")
+    add("--report-seed", type=reset_seed, default=10_000, help="reset seed of the first of them (default: 10000)")
     add("--storage", help="Optuna RDB URL, or path of a journal file (default: study.log in the output folder)")
     add("--study-name", help="default: the run folder's name")
     add("--output", type=Path, metavar="DIR", help="default: RUN_DIR/tune")
     add("--timeout", type=float, default=math.inf, metavar="SECONDS", help="begin no trial after this time")
-    add("--device", default="auto", help="torch device (default: auto)")
+    add("--device", type=device, default="auto", help="torch device (default: auto)")
     add("--num-threads", type=int, default=1, help="torch threads, which wait for each other beside another process "
         "(default: 1)")  # fmt: skip
     add("-P", "--progress", action="store_true", help="show a progress bar while a planner trains")
@@ -139,10 +149,10 @@ def tune(args: argparse.Namespace) -> None:
     common = {key: value for key, value in common.items() if key not in tried}
     if args.sampler == "tpe":
         common |= tried | {name: [min(tried[name]), max(tried[name])] for name in DRAWN if name in tried}
-    storage, name = args.storage or str(folder / "study.log"), args.study_name or args.run.resolve().name
-    study = open_study(folder, storage, name, common, args.prune)
+    study = open_study(folder, args.storage, args.study_name, common, args.prune, args.run.resolve().name)
+    where = args.storage or folder / OWN_STUDY
     print(
-        f"{common['env']}, delay {common['delay']}: {len(finished(study))} trials are finished in {storage}", flush=True
+        f"{common['env']}, delay {common['delay']}: {len(finished(study))} trials are finished in {where}", flush=True
     )
 
     def play(seed: int, n: int) -> list[float]:

@@ -19,6 +19,7 @@ from sb3_said.delays import (
     FixedDelay,
     PeriodicPackets,
     RandomWalkDelay,
+    TotalDelay,
     UniformDelay,
 )
 from sb3_said.delays.processes import packet_delays
@@ -149,6 +150,8 @@ COPIED = [
     (UniformDelay(0, 8), 0),
     (DroppedPackets(UniformDelay(0, 8), p=0.3), 0),
     (RandomWalkDelay(0, 8, move_prob=0.5), UniformDelay(0, 3)),
+    (2, (0, 5)),
+    (DroppedPackets(TotalDelay(UniformDelay(0, 3), EpisodeDelay(0, 5)), p=0.3), 0),
 ]
 
 

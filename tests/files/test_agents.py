@@ -248,6 +248,11 @@ def test_policies_of_another_class_or_kind_are_refused(saved, tmp_path):
         DelayedSACPolicy.load(tmp_path / "nowhere")
 
 
+def test_a_device_that_torch_does_not_know_is_no_fault_of_the_file(saved):
+    with pytest.raises(RuntimeError, match="gpu"):
+        DelayedSAC.load(saved, device="gpu")
+
+
 def test_a_policy_that_cannot_be_written_leaves_the_old_file(tmp_path):
     make_policy().save(tmp_path / "policy")
     before = (tmp_path / "policy").read_bytes()

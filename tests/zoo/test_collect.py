@@ -64,9 +64,12 @@ def test_the_log_is_what_the_task_was_in_and_given(action_delay: Any) -> None:
         np.testing.assert_allclose(data.rewards[rows], np.array(task.actions[i])[:, 0], atol=1e-6)
 
 
-def test_shares_are_equal_repeatable_and_cut_where_they_are_full(run: Path, tmp_path: Path) -> None:
+def test_shares_are_equal_repeatable_and_cut_where_they_are_full(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     words = (run, "random", "--noise", "0", "0.5", "--steps", "203", "--seed", "5")
     data, again = collected(tmp_path / "a.npz", *words), collected(tmp_path / "b.npz", *words)
+    told_of = capsys.readouterr().err
     assert len(data) == 203
     for name in ("states", "actions", "rewards", "terminated", "ends", "finals"):
         np.testing.assert_array_equal(getattr(data, name), getattr(again, name))
@@ -80,6 +83,9 @@ def test_shares_are_equal_repeatable_and_cut_where_they_are_full(run: Path, tmp_
     assert len(set(played.lengths[:n_first])) > 1  # in the order of seeds: short ones end first
     assert data.lengths[: n_first - 1].tolist() == played.lengths[: n_first - 1].tolist()
     np.testing.assert_allclose(data.returns[: n_first - 1], played.returns[: n_first - 1])
+    assert data.lengths[n_first - 1] < played.lengths[n_first - 1]  # cut off: its return is no episode's
+    assert about["shares"][0]["mean_return"] == pytest.approx(np.mean(played.returns[: n_first - 1]))
+    assert f"{n_first} episodes, mean return {np.mean(played.returns[: n_first - 1]):.1f}" in told_of
     with pytest.raises(ValueError, match=rf"a\.npz is of {ENV}, and the task is Pendulum-v1"):
         load_dataset(tmp_path / "a.npz", *spaces_of(ENV), "Pendulum-v1")
 
@@ -106,6 +112,14 @@ def test_a_cut_episode_is_no_terminal_and_keeps_the_state_after_it(run: Path, tm
     assert cut.ends.tolist() == [False] * (length - 2) + [True] and not cut.terminated.any()
     np.testing.assert_array_equal(cut.finals[0], whole.states[length - 1])
     assert whole.terminated[length - 1]
+    assert json.loads(str(np.load(tmp_path / "cut.npz")["about"]))["shares"][0]["mean_return"] is None
+
+
+def test_a_place_that_cannot_be_written_is_told_before_any_step(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(collect, "play", lambda *_: pytest.fail("a step was taken"))
+    with pytest.raises(SystemExit) as stop:
+        collect.main([str(run), "-o", str(run / "run.json" / "log.npz")])
+    assert stop.value.code == 1
 
 
 def test_noise_has_the_size_asked_for_in_units_of_the_range() -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.evaluation import collect_observations
 from sb3_said.files.normalization import normalization_file
 from sb3_said.zoo import decide, evaluate
+from sb3_said.zoo.record import Record
 
 NEW = ["--temperature", "0.5", "--n-candidates", "3", "--choice-factor", "2", "--sampling-steps", "1"]
 
@@ -91,6 +94,18 @@ def test_statistics_of_normalised_observations_go_with_the_file(run: Path, tmp_p
     decide.main([str(source), "--compact", "-o", str(tmp_path / "elsewhere" / "small.zip")])
     assert normalization_file(tmp_path / "elsewhere" / "small.zip").read_bytes() == b"statistics"
     decide.main([str(source), "--compact", "-o", str(source)])  # in place
+
+
+def test_what_a_run_changes_in_its_task_is_told_where_the_file_leaves_it(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    changed = Path(shutil.copytree(run, tmp_path / "changed"))
+    replace(Record.read(run), env_kwargs={"reset_noise_scale": 0.1}).write(changed)
+    decide.main([str(changed), "--compact", "-o", str(tmp_path / "agent.zip")])
+    assert "{'env_kwargs': {'reset_noise_scale': 0.1}}" in capsys.readouterr().out
+    decide.main([str(changed), "--compact", "-o", str(changed / "agent.zip")])
+    decide.main([str(run), "--compact", "-o", str(tmp_path / "plain.zip")])
+    assert "does not keep" not in capsys.readouterr().out
 
 
 def test_a_file_s_name_gets_its_suffix(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -176,6 +176,10 @@ def test_an_agent_of_sb3_itself_is_not_opened(run: Path, tmp_path: Path) -> None
         (["--algo", "nonsense"], "give --algo"),
         (["--period", "0.02"], "needs --realtime"),
         (["--realtime", "--period", "0"], "above 0"),
+        (["--json", "."], "it is a folder. Give the path of a file"),
+        (["--plot", "plot.xyz"], "give it the suffix .png"),
+        (["--seed", "-5"], "a reset seed is a whole number, 0 or more, got -5"),
+        (["--device", "gpu"], "auto, cpu, cuda or another that torch has, got gpu"),
     ],
 )
 def test_evaluate_says_what_is_wrong(
@@ -184,6 +188,26 @@ def test_evaluate_says_what_is_wrong(
     with pytest.raises(SystemExit) as exit_info:
         evaluate.main([str(run), *arguments])
     assert exit_info.value.code == 2 and message in capsys.readouterr().err
+
+
+def test_an_interrupted_evaluation_ends_without_a_traceback(
+    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: Any, **__: Any) -> Any:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(evaluate, "evaluate", interrupted)
+    with pytest.raises(SystemExit) as exit_info:
+        evaluate.main([str(run)])
+    assert exit_info.value.code == 130 and "Interrupted." in capsys.readouterr().err
+
+
+def test_an_agent_of_other_actions_is_not_played(tmp_path: Path) -> None:
+    """Its run had a wrapper that scales them, which a file alone does not name."""
+    env = DelayedObservationWrapper(gym.wrappers.RescaleAction(gym.make("Pendulum-v1"), -1.0, 1.0), 1)
+    DelayedSAC("MultiInputPolicy", env, buffer_size=10, device="cpu").save(tmp_path / "agent.zip")
+    with pytest.raises(ValueError, match=r"sends actions in Box\(-1.0, 1.0.* the task takes Box\(-2.0, 2.0"):
+        load_run(tmp_path / "agent.zip", "sadr", device="cpu")
 
 
 def test_a_place_that_cannot_be_written_is_told_before_any_episode(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:

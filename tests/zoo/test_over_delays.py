@@ -292,6 +292,8 @@ def test_training_seeds_of_one_label_are_one_row(
         assert rows["three seeds"][column].strip() == f"{np.mean(means):.1f} [{t.low:.1f}, {t.high:.1f}]"
     assert "95 % intervals over 3 training seeds (Student's t), or 3 episodes (Student's t)" in out
     assert "95 % intervals over 9 episodes (stratified bootstrap)" in out
+    assert f"three seeds: 3 agents, {', '.join(dict.fromkeys(one for one, _ in returns))}" in out
+    assert "one: 1 agents" not in out
     assert titles == [f"{ENV} under delay: means of 3 episodes, 95 % intervals"]
 
 

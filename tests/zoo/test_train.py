@@ -325,6 +325,9 @@ def test_the_expert_can_learn_under_another_delay(tmp_path: Path, monkeypatch: p
         ("--gym-packages not_there", "No module named 'not_there'"),
         ("--checkpoint-freq 0", "--checkpoint-freq must be at least 1, got 0"),
         ("-params gamma:O.9", "invalid syntax"),
+        ("-n 0", "steps are a whole number, at least 1; -1 takes the preset's, got 0"),
+        ("--n-timesteps -7", "got -7"),
+        ("--device gpu", "auto, cpu, cuda or another that torch has, got gpu"),
         ("-params gamma:nine", "name 'nine' is not defined"),
     ],
 )

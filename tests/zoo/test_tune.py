@@ -106,6 +106,12 @@ def test_a_search_from_grid_to_report(
     assert not seeds and "No trial is left" in out and "4 trials" in out and "Training" not in out
     assert results_of(run)["report"] == results["report"]
 
+    # Its folder may be renamed.
+    renamed = run.rename(run.with_name("renamed"))
+    tune.main([str(renamed), *command[1:]])
+    assert not seeds and "4 trials are finished" in capsys.readouterr().out
+    renamed.rename(run)
+
     # A training reads the winner.
     best = run / "tune" / "best.yml"
     assert f"sb3-said train --algo said --env {ENV} --delay 2 -conf {best}" in out
@@ -197,6 +203,7 @@ def test_two_workers_share_a_study_and_train_no_depth_twice(run: Path, capsys: p
         (["--depths", "0"], "depth is 0"),
         (["--choice-factors", "-1"], "choice_factor is -1"),
         (["--depths", "1", "--timeout", "0"], "No trial is finished"),
+        (["--storage", "nonsense://x"], "--storage nonsense://x cannot be opened"),
     ],
 )
 def test_says_what_is_wrong(run: Path, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
