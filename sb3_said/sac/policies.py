@@ -18,6 +18,7 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
+from torch import nn
 
 from sb3_said.delays.space import UNDELAYED, check_spaces
 from sb3_said.files.agents import SafePolicyMixin
@@ -39,6 +40,7 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
     :param normalise_states: both read z-scores of states (see :class:`~sb3_said.sac.scaling.StateNormalizer`)
     :param scale_rewards: the critics' values are in units of a :class:`~sb3_said.sac.scaling.ReturnScale`
     :param average_actor: an average of the actor's weights answers, see :meth:`without_average`
+    :param critic_layer_norm: a LayerNorm follows each hidden layer of the critics, before its activation
     :param policy_kwargs: of ``SACPolicy``
     :raises ValueError: for other spaces, or when a features extractor is given or shared in a delayed task
     """
@@ -54,6 +56,7 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         normalise_states: bool = False,
         scale_rewards: bool = False,
         average_actor: bool = False,
+        critic_layer_norm: bool = False,
         **policy_kwargs: Any,
     ):
         state_space, _, self.max_delay = check_spaces(observation_space, action_space)
@@ -62,6 +65,7 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         self.normalise_states = normalise_states
         self.scale_rewards = scale_rewards
         self.average_actor = average_actor
+        self.critic_layer_norm = critic_layer_norm
         self.replay_space: spaces.Dict | None = None
         if isinstance(observation_space, spaces.Dict):
             own = {name: policy_kwargs.get(name) for name in ("share_features_extractor", "features_extractor_kwargs")}
@@ -118,7 +122,14 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
         key = UNDELAYED if self.delay_reconciled_critic else "observation"
-        return super().make_critic(features_extractor or self._extractor(self.critic_kwargs, key))
+        critic = super().make_critic(features_extractor or self._extractor(self.critic_kwargs, key))
+        if self.critic_layer_norm:
+            for network in critic.q_networks:
+                assert isinstance(network, nn.Sequential)  # as SB3 makes them
+                for hidden in [layer for layer in network if isinstance(layer, nn.Linear)][:-1]:
+                    norm = nn.LayerNorm(hidden.out_features, device=hidden.weight.device)
+                    network.insert([*network].index(hidden) + 1, norm)
+        return critic
 
     def _extractor(self, network_kwargs: dict[str, Any], key: str) -> BaseFeaturesExtractor | None:
         if self.replay_space is None:
@@ -218,6 +229,7 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
             "normalise_states": self.normalise_states,
             "scale_rewards": self.scale_rewards,
             "average_actor": self.average_actor,
+            "critic_layer_norm": self.critic_layer_norm,
         }
 
 

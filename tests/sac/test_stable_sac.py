@@ -388,6 +388,26 @@ def test_it_learns_to_be_where_rewards_are():
     assert np.mean(states[-8:]) == pytest.approx(0.5, abs=0.25)
 
 
+def test_each_hidden_layer_of_the_critics_is_normalised_before_its_activation(tmp_path):
+    networks = {"net_arch": {"pi": [8], "qf": [16, 12]}}
+    learned = make(delayed(3), critic_layer_norm=True, policy_kwargs=networks).learn(40)
+    learned.save(tmp_path / "agent.zip")
+    model = StableSAC.load(tmp_path / "agent.zip", device="cpu")
+    model.replay_buffer = learned.replay_buffer
+    batch = model.replay_buffer.sample(9)
+    z = model.policy.state_normalizer(batch.observations[UNDELAYED])
+    x = th.cat([z, batch.actions], dim=1)  # (B, obs_dim + act_dim)
+    for network, values in zip(model.critic.q_networks, model.critic(batch.observations, batch.actions), strict=True):
+        hidden, weights = x, [*network.parameters()]
+        for k in (0, 4):  # weight, bias, gain, offset of a hidden layer
+            weight, bias, gain, offset = weights[k : k + 4]
+            hidden = hidden @ weight.T + bias
+            hidden = (hidden - hidden.mean(1, keepdim=True)) / (hidden.var(1, keepdim=True, correction=0) + 1e-5).sqrt()
+            hidden = (hidden * gain + offset).clamp(min=0)
+        th.testing.assert_close(values, hidden @ weights[8].T + weights[9], rtol=1e-4, atol=1e-5)
+    assert not [layer for layer in model.actor.modules() if isinstance(layer, th.nn.LayerNorm)]
+
+
 # ------------------------------------------------------------------------------------------------------------ files
 
 
