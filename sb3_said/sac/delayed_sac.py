@@ -74,6 +74,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
     counters = (*SafeSaveMixin.counters, "trained_ages")
     own_classes = (DelayedReplayBuffer,)
     policy: DelayedSACPolicy
+    _left_at: list[tuple[int, int]] | None = None  # what Monitors of a task without delay had counted
     replay_buffer: DelayedReplayBuffer
 
     def __init__(
@@ -183,12 +184,19 @@ class DelayedSAC(SafeSaveMixin, SAC):
         return learn
 
     def _are_at(self, obs: np.ndarray | dict[str, np.ndarray]) -> bool:
-        """Tell whether the environments handed out these observations last; those without delay cannot say."""
+        """Tell whether the environments handed out these observations last, and nobody has played them since."""
         assert self.env is not None
         if not isinstance(obs, dict) or not self.env.has_attr("handed_out"):
-            return False
+            return self._left_at is not None and self._left_at == self._steps_counted()
         last = self.env.get_attr("handed_out")
         return all(np.array_equal(obs[key][i], part) for i, parts in enumerate(last) for key, part in parts.items())
+
+    def _steps_counted(self) -> list[tuple[int, int]] | None:
+        """Return what SB3's ``Monitor`` has counted of each environment, in all and in this episode; None without."""
+        assert self.env is not None
+        if not (self.env.has_attr("total_steps") and self.env.has_attr("rewards")):
+            return None
+        return [*zip(self.env.get_attr("total_steps"), map(len, self.env.get_attr("rewards")), strict=True)]
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
         """Collect as SB3 does, which does not store the step at which a callback ends training, or an exception.
@@ -202,6 +210,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
         finally:
             if rollout is None or not rollout.continue_training:
                 self._last_obs = None
+            elif not isinstance(self.observation_space, spaces.Dict):
+                self._left_at = self._steps_counted()
 
     def _sample_action(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, np.ndarray]:
         if self._last_obs is None:  # a callback has played the environment, as a trial does

@@ -81,8 +81,9 @@ def test_learning_goes_on_after_a_rollout_that_was_cut_short(make_env, end, monk
     assert model.replay_buffer.window_source().remaining.max() == 12
 
 
-def test_consecutive_learning_goes_on_amid_an_episode(monkeypatch):
-    model = make(delayed(4), learning_starts=100)
+@pytest.mark.parametrize("make_env", [Drift, lambda: delayed(4)], ids=["plain", "4"])
+def test_consecutive_learning_goes_on_amid_an_episode(make_env, monkeypatch):
+    model = make(make_env(), learning_starts=100)
     rows = record(model, monkeypatch)
     for _ in range(4):
         model.learn(10, reset_num_timesteps=False)
