@@ -36,7 +36,7 @@ class OnnxModel:
         except Exception as error:  # onnxruntime has many kinds
             raise ValueError(f"{path} is no file of sb3-said export, or damaged ({error}): export it again.") from error
         #: Whether it reads what VecNormalize has normalised; files of before 2026-11-26 do not say.
-        self.reads_normalized = json.loads(properties.get("reads_normalized", "false")) is True
+        self.reads_normalized = properties.get("reads_normalized") == "true"
         self._keys = [each.name for each in self._session.get_inputs()]
         self.action_space = spaces.Box(low, high)
         state_space = spaces.Box(-np.inf, np.inf, (self._session.get_inputs()[0].shape[1],), np.float32)

@@ -74,8 +74,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
     counters = (*SafeSaveMixin.counters, "trained_ages")
     own_classes = (DelayedReplayBuffer,)
     policy: DelayedSACPolicy
-    _left_at: list[tuple[int, int]] | None = None  # what Monitors of a task without delay had counted
     replay_buffer: DelayedReplayBuffer
+    _left_at: list[tuple[int, int]] | None = None  # what Monitors of a task without delay had counted
 
     def __init__(
         self,
@@ -210,8 +210,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
         finally:
             if rollout is None or not rollout.continue_training:
                 self._last_obs = None
-            elif not isinstance(self.observation_space, spaces.Dict):
-                self._left_at = self._steps_counted()
+            elif self.num_timesteps >= self._total_timesteps and not isinstance(self.observation_space, spaces.Dict):
+                self._left_at = self._steps_counted()  # after the last rollout of this call
 
     def _sample_action(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, np.ndarray]:
         if self._last_obs is None:  # a callback has played the environment, as a trial does

@@ -77,6 +77,7 @@ def opened(args: argparse.Namespace) -> tuple[dict[str, LoadedRun], Path, float]
     th.set_num_threads(args.num_threads)
     if args.plot is not None:
         plots.check_file(args.plot)  # what cannot be drawn is told now, and not after the episodes
+        check_writable(args.plot)
     delay = 0 if args.realtime and not args.delay else read_delay(args.delay)
     how_played = args.algo, args.env, delay, args.device, None, args.gym_packages
     run = load_run(args.run, *how_played)
@@ -91,8 +92,7 @@ def opened(args: argparse.Namespace) -> tuple[dict[str, LoadedRun], Path, float]
         raise ValueError(f"{run.info['env']} does not tell how long a control step is: give --period.")
     name = "realtime.json" if args.realtime else "evaluation.json"
     target = args.json or run.folder / (name if Path(args.run).is_dir() else f"{Path(args.run).stem}_{name}")
-    for file in (target, *([args.plot] if args.plot else [])):
-        check_writable(file)
+    check_writable(target)
     return runs, target, period
 
 

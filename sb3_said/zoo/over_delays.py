@@ -80,7 +80,6 @@ def main(argv: list[str] | None = None) -> None:
             plots.check_file(args.plot)  # what cannot be drawn is told now, and not after the episodes
             check_writable(args.plot)
         delays = list(dict.fromkeys(read_name(word) for word in args.delays or ()))
-        check_writable(args.json)
         shown = play_missing(args, delays) if args.runs else known_cells(args.json, delays)
         rows = choose_rows(args.rows, shown)
     table = make_table(shown, rows)
@@ -151,6 +150,7 @@ def play_missing(args: argparse.Namespace, delays: list[int | str]) -> list[Cell
     """
     if not delays:
         raise ValueError("--delays is missing: name the delays that the runs are to play.")
+    check_writable(args.json)
     runs = open_runs(args)
     first = next(iter(runs.values()))[0]
     settings = {"env": first.info["env"], "n_episodes": args.episodes, "seed": args.seed, "deterministic": True}

@@ -148,26 +148,25 @@ def play_trial(
 
 
 def open_study(
-    folder: Path, storage: str | None, name: str | None, settings: dict[str, Any], prune: float, new_name: str = "said"
+    folder: Path, storage: str, name: str | None, settings: dict[str, Any], prune: float, new_name: str = "said"
 ) -> optuna.Study:
     """Open a study, or begin it.
 
     :param folder: shared by the workers, for a lock
-    :param storage: an Optuna RDB URL, or the path of a journal file; by default ``study.log`` in the folder
+    :param storage: an Optuna RDB URL, or the path of a journal file
     :param name: of the study; by default the one of the folder's own file, whatever the run was named when it began
     :param settings: in JSON types, what all trials must have in common to be compared
     :param prune: p-value below which a trial is pruned; 0 prunes none
     :param new_name: of a study that begins without a name
     :raises ValueError: when the study was begun with other settings, or a data base cannot be opened
     """
-    own = str(folder / OWN_STUDY)
     folder.mkdir(parents=True, exist_ok=True)
     with warnings.catch_warnings(), FileLock(folder / "study.lock"):
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         pruner = optuna.pruners.WilcoxonPruner(p_threshold=prune) if prune > 0 else optuna.pruners.NopPruner()
-        backend = _open_storage(storage or own)
+        backend = _open_storage(storage)
         if name is None:
-            known = optuna.get_all_study_names(backend) if storage in (None, own) else []
+            known = optuna.get_all_study_names(backend) if storage == str(folder / OWN_STUDY) else []
             name = known[0] if len(known) == 1 else new_name
         study = optuna.create_study(
             storage=backend, study_name=name, direction="maximize", load_if_exists=True, pruner=pruner
@@ -175,7 +174,7 @@ def open_study(
         if "settings" not in study.user_attrs:
             study.set_user_attr("settings", settings)
     advice = "Go on with the old ones, or begin another study with --study-name."
-    check_same(f"Study {name!r} in {storage or own} was begun", study.user_attrs["settings"], settings, advice)
+    check_same(f"Study {name!r} in {storage} was begun", study.user_attrs["settings"], settings, advice)
     return study
 
 

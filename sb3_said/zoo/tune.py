@@ -149,10 +149,10 @@ def tune(args: argparse.Namespace) -> None:
     common = {key: value for key, value in common.items() if key not in tried}
     if args.sampler == "tpe":
         common |= tried | {name: [min(tried[name]), max(tried[name])] for name in DRAWN if name in tried}
-    study = open_study(folder, args.storage, args.study_name, common, args.prune, args.run.resolve().name)
-    where = args.storage or folder / OWN_STUDY
+    storage = args.storage or str(folder / OWN_STUDY)
+    study = open_study(folder, storage, args.study_name, common, args.prune, args.run.resolve().name)
     print(
-        f"{common['env']}, delay {common['delay']}: {len(finished(study))} trials are finished in {where}", flush=True
+        f"{common['env']}, delay {common['delay']}: {len(finished(study))} trials are finished in {storage}", flush=True
     )
 
     def play(seed: int, n: int) -> list[float]:

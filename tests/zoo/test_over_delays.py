@@ -199,6 +199,12 @@ def test_without_runs_what_was_played_is_shown(
     assert "--delays is missing" in capsys.readouterr().err
 
 
+def test_what_was_played_is_shown_where_nothing_can_be_written(sadr: Path, tmp_path: Path, monkeypatch) -> None:
+    play(tmp_path / "out.json", [sadr], ["1"])
+    monkeypatch.setattr(over_delays, "check_writable", lambda path: pytest.fail(f"{path} is to be written"))
+    over_delays.main(["--json", str(tmp_path / "out.json")])
+
+
 def test_a_changed_agent_is_played_again(said: Path, tmp_path: Path, monkeypatch) -> None:
     file, folder = tmp_path / "out.json", tmp_path / "d1"
     write_run(folder, DelayedSAC, 1)
