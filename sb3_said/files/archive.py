@@ -23,7 +23,6 @@ import torch as th
 from sb3_said.files.atomic import PathOrFile, replacing
 
 FORMAT = 3
-_UNSEALED_FORMAT = 2  # files without a seal, which are read as before
 
 _MAX_DOCUMENT = 2**24  # bytes of tree.json, whose objects take twenty times as much memory
 _MAX_HEADER = 1024  # bytes that describe an array of numbers; a longer text could exhaust NumPy's parser
@@ -220,7 +219,7 @@ def _opened(source: PathOrFile) -> Iterator[tuple[zipfile.ZipFile, dict[str, Any
                 f"its format number is {document['format']}, this sb3_said reads up to {FORMAT}: upgrade sb3_said"
                 f" (the file was written with {document.get('versions')!s:.200})"
             )
-        if document["format"] != _UNSEALED_FORMAT and archive.comment != seal(archive):
+        if archive.comment != seal(archive):
             raise SavedFileError("it was changed after sb3_said wrote it")
         yield archive, document
 

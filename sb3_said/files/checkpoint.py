@@ -204,7 +204,7 @@ def restore_evaluations(callback: BaseCallback | None, saved: list[dict[str, Any
     for eval_callback, kept in zip(eval_callbacks, saved, strict=True):
         for name in _EVALUATION:
             setattr(eval_callback, name, kept[name])
-        eval_callback.evaluations_successes = kept.get(_SUCCESSES, [])
+        eval_callback.evaluations_successes = kept[_SUCCESSES]
 
 
 def restore_training(model: SafeSaveMixin, path: str | Path, callback: BaseCallback | None = None) -> None:
@@ -289,7 +289,7 @@ def _check_evaluation(saved: dict[str, Any]) -> None:
         raise SavedFileError(f"an evaluation has n_calls {saved['n_calls']!s:.20} and the best mean {best!s:.20}")
     if any(type(rows) is not list or len(rows) != len(results[0]) for rows in results):
         raise SavedFileError("evaluations differ in how many they are")
-    successes = saved.get(_SUCCESSES, [])
+    successes = saved[_SUCCESSES]
     if type(successes) is not list or len(successes) not in (0, len(results[0])):
         raise SavedFileError("evaluations differ in how many they are")
     if any(np.asarray(rows).dtype.kind not in "bif" for rows in (*results, successes) if rows):

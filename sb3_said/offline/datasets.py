@@ -104,6 +104,7 @@ class Dataset:
             "ends": np.append(self.ends[:-1], False),  # the newest row's tail is what follows the buffer
         }
         state = {name: column[:, None] for name, column in rows.items()} | {
+            "holds_logs": True,
             "pos": len(self),
             "full": False,
             "expected": None,

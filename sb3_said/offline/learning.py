@@ -38,7 +38,6 @@ class OfflineAlgorithm(DelayedSAC):
     """
 
     learns_online: ClassVar[bool] = False
-    _replays_logs = False  # since take_dataset
 
     def learn(self: SelfOffline, *args: Any, **kwargs: Any) -> SelfOffline:
         """Learn from the environment, where the subclass does.
@@ -50,11 +49,11 @@ class OfflineAlgorithm(DelayedSAC):
                 f"{type(self).__name__} learns from logs: call learn_offline(dataset, gradient_steps), with logs such "
                 "as sb3-said collect makes."
             )
-        if self._replays_logs:
+        if self.replay_buffer.holds_logs:
             warnings.warn(
                 "The agent collects steps of its own now: its replay no longer holds the dataset.", stacklevel=3
             )
-            self.replay_buffer, self._replays_logs = self._new_replay_buffer(), False
+            self.replay_buffer = self._new_replay_buffer()
             self.num_timesteps = 0  # counted updates of learn_offline
         elif self._n_updates == 0 and self.replay_buffer.size() == 0:  # as of one that was saved since
             self.num_timesteps = 0
@@ -153,7 +152,6 @@ class OfflineAlgorithm(DelayedSAC):
             device=self.device,
             relabelled_ages=self.relabelled_ages,
         )
-        self._replays_logs = True
 
     def _draw_ages(self) -> Callable[[int], np.ndarray] | None:
         """Return how to draw the ages of an episode, as its environment's receiver and actuator do in play."""

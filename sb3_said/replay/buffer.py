@@ -92,6 +92,7 @@ class DelayedReplayBuffer(ReplayBuffer):
         self._next_ages = np.zeros(n_envs, np.int16)
         self._expected: dict[str, np.ndarray] | None = None
         self._has_warned_of_actions = False
+        self.holds_logs = False  # that an agent was given, and did not collect
 
     # ------------------------------------------------------------------------------------------------ writing
 
@@ -357,11 +358,7 @@ class DelayedReplayBuffer(ReplayBuffer):
         last = np.where(ends, np.arange(n_rows)[:, None], n_rows)
         last = np.minimum.accumulate(last[::-1], axis=0)[::-1]  # (T, n_envs): where each episode ends
 
-        states = self.observations
-        if env is not None and self.is_delayed:
-            states = env.normalize_obs({"observation": states})["observation"]
-        elif env is not None:
-            states = env.normalize_obs(states)  # type: ignore[assignment]  # an array for an array
+        states = self.observations if env is None else self.normalized(self.observations, env)
         grid = np.broadcast_to(rows[:, None], ends.shape), np.broadcast_to(np.arange(self.n_envs), ends.shape)
         remaining = last - np.arange(n_rows)[:, None] + 1
         episodes = last + np.arange(self.n_envs) * n_rows  # unique for each environment and end
@@ -373,6 +370,11 @@ class DelayedReplayBuffer(ReplayBuffer):
             th.from_numpy((self.dones > 0) & (self.timeouts == 0)),
             *(th.from_numpy(x.flatten()) for x in per_start),  # a copy: the grid is read-only
         )
+
+    def normalized(self, states: np.ndarray, env: VecNormalize) -> np.ndarray:
+        """Return states (..., obs_dim) as the expert's observations are normalised."""
+        obs: Any = env.normalize_obs({"observation": states} if self.is_delayed else states)
+        return obs["observation"] if self.is_delayed else obs
 
     def sample_windows(self, batch_size: int, length: int, generator: th.Generator | None = None) -> Windows:
         """Sample planner windows uniformly over all stored steps.
@@ -391,6 +393,7 @@ class DelayedReplayBuffer(ReplayBuffer):
         The arrays are this buffer's own memory: write them out, or copy them, before adding on.
         """
         return {
+            "holds_logs": self.holds_logs,
             "pos": self.pos,
             "full": self.full,
             "expected": self._expected,
@@ -411,6 +414,7 @@ class DelayedReplayBuffer(ReplayBuffer):
         """
         size = len(state["rewards"])
         check_stored(self, state)
+        self.holds_logs = state["holds_logs"]
         self.pos, self.full, self._expected = state["pos"], state["full"], state["expected"]
         self._next_states, self._next_ages = state["next_states"].copy(), state["next_ages"].copy()
         places = map(tuple, state["tail_places"].tolist())

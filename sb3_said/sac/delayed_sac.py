@@ -142,7 +142,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
         if isinstance(env, DummyVecEnv) and env.envs[0].spec is not None:
             self.task = env.envs[0].spec.id
         elif env is not None and env.has_attr("task_id"):
-            self.task = env.get_attr("task_id", 0)[0] or self.task
+            found = env.get_attr("task_id", 0)[0]  # of a wrapper of ours; a task may mean something else by it
+            self.task = found if isinstance(found, str) else self.task
 
     def _check_env(self, env: GymEnv) -> None:
         """Refuse spaces that are not served, and what no space tells of an environment, with a ``ValueError``."""
@@ -192,11 +193,15 @@ class DelayedSAC(SafeSaveMixin, SAC):
         return all(np.array_equal(obs[key][i], part) for i, parts in enumerate(last) for key, part in parts.items())
 
     def _steps_counted(self) -> list[tuple[int, int]] | None:
-        """Return what SB3's ``Monitor`` has counted of each environment, in all and in this episode; None without."""
+        """Return what SB3's ``Monitor`` has counted of each environment, in all and in this episode.
+
+        None without Monitors, and where an episode has no step yet: they do not tell one reset from another.
+        """
         assert self.env is not None
-        if not (self.env.has_attr("total_steps") and self.env.has_attr("rewards")):
+        if not all(self.env.env_is_wrapped(Monitor)):
             return None
-        return [*zip(self.env.get_attr("total_steps"), map(len, self.env.get_attr("rewards")), strict=True)]
+        in_episode = [len(rewards) for rewards in self.env.get_attr("rewards")]
+        return [*zip(self.env.get_attr("total_steps"), in_episode, strict=True)] if all(in_episode) else None
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
         """Collect as SB3 does, which does not store the step at which a callback ends training, or an exception.
@@ -242,17 +247,22 @@ class DelayedSAC(SafeSaveMixin, SAC):
         found = [unwrap_vec_wrapper(self.env, VecMonitor), *(unwrap_wrapper(env, Monitor) for env in envs)]
         monitors = [monitor for monitor in found if isinstance(monitor, (Monitor, VecMonitor))]
         writers = [monitor.results_writer for monitor in monitors]
+        strict = [monitor for monitor in monitors if isinstance(monitor, Monitor) and not monitor.allow_early_resets]
         normalizer = self._vec_normalize_env
         before = None if normalizer is None else (normalizer.training, normalizer.norm_reward)
         if normalizer is not None:
             normalizer.training = normalizer.norm_reward = False
         for monitor in monitors:
             monitor.results_writer = None
+        for monitor in strict:
+            monitor.allow_early_resets = True
         try:
             yield self.env
         finally:
             for monitor, writer in zip(monitors, writers, strict=True):
                 monitor.results_writer = writer
+            for monitor in strict:
+                monitor.needs_reset, monitor.allow_early_resets = True, False
             self._last_obs = None  # SB3 then resets the environments
             if normalizer is not None and before is not None:
                 normalizer.training, normalizer.norm_reward = before
@@ -277,16 +287,18 @@ class DelayedSAC(SafeSaveMixin, SAC):
                 f" where its delays allow, give it DelayedObservationWrapper(..., max_delay={own})."
             )
         self.check_ages(ages_of(env))
-        was_normalized = self.reads_normalized and self.trained_ages is not None
+        learned_normalized = self.reads_normalized
         super().set_env(env, force_reset)
         self._note_task()
-        if was_normalized and not self.reads_normalized:
-            self.reads_normalized = True  # until it learns here
-            warnings.warn(
-                f"This {type(self).__name__} learned from observations that VecNormalize had normalised, and those of "
-                "this environment are not: give it load_normalization(path, venv), or SB3's VecNormalize.load.",
-                stacklevel=3,
-            )
+        if self.trained_ages is not None and learned_normalized != self.reads_normalized:
+            self.reads_normalized = learned_normalized  # until it learns here
+            how, remedy = (
+                ("that VecNormalize had normalised, and those of this environment are not",
+                 "give it load_normalization(path, venv), or SB3's VecNormalize.load")
+                if learned_normalized
+                else ("as they are, and VecNormalize normalises those of this environment", "leave it out")
+            )  # fmt: skip
+            warnings.warn(f"This {type(self).__name__} learned from observations {how}: {remedy}.", stacklevel=3)
 
     def check_ages(self, ages: list[int]) -> None:
         """Warn where an agent is to act on observations of ages that it has not met in training, amid episodes.

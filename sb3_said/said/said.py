@@ -11,7 +11,6 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import configure_logger
@@ -207,7 +206,7 @@ class SAID(OfflineAlgorithm, StableSAC):
                 "give it as planner_kwargs of a new agent."
             )
         check_scored(settings, self.policy.values is not None)
-        if settings.get("decided_by") == "actor" and self._n_updates == 0:
+        if settings.get("decided_by") == "actor" and not self.has_expert:
             raise ValueError("decided_by='actor' lets the expert's actor decide, which this agent has not trained.")
         self.policy.planner.config = replace(self.policy.planner.config, **settings)
 
@@ -216,8 +215,10 @@ class SAID(OfflineAlgorithm, StableSAC):
 
         :raises ValueError: as it does, and for an expert that has learned nothing, where the planner has
         """
-        if who in ("expert", "both") and self._n_updates == 0 and self.policy.planner_is_trained:
-            raise ValueError(f"The expert has learned nothing, as this agent learned from logs alone: got {who!r}.")
+        if who in ("expert", "both") and not self.has_expert and self.policy.planner_is_trained:
+            raise ValueError(
+                f"The expert has learned nothing, as after logs alone or within learning_starts steps: got {who!r}."
+            )
         self.policy.set_answer(who, expert_up_to, expert_from)
 
     def check_ages(self, ages: list[int]) -> None:
@@ -288,7 +289,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         replay, newest, env = self.replay_buffer, self.newest_fraction, self._vec_normalize_env
         source = replay.window_source(newest, env)
         has_older = len(source) < replay.size() * replay.n_envs  # a log's replay has one, whatever the agent has
-        bootstrap = self._stored_values if self._n_updates > 0 else None  # offline there are no critics
+        bootstrap = self._stored_values if self.has_expert else None  # offline there are no critics
         values = returns_to_go(source, self.gamma, self.planner_terminal_penalty, bootstrap)
         return PlannerTrainer(
             self.policy.planner,
@@ -300,9 +301,14 @@ class SAID(OfflineAlgorithm, StableSAC):
         )
 
     @property
+    def has_expert(self) -> bool:
+        """Whether actor and critics have learned, here or where ``set_parameters`` has them from."""
+        return self._n_updates > 0 or len(self.actor.optimizer.state) > 0
+
+    @property
     def newest_fraction(self) -> float:
         """The part of the replay that is imitated: all of a log, no step of which is newer than another."""
-        return 1.0 if self._replays_logs else self.planner_newest_fraction
+        return 1.0 if self.replay_buffer.holds_logs else self.planner_newest_fraction
 
     @th.no_grad()
     def _stored_values(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
@@ -337,7 +343,8 @@ class SAID(OfflineAlgorithm, StableSAC):
         :param log_interval: updates between two rows of losses in the log
         :param eval_interval: updates between two measurements of the held-out errors, beside the regression's
         :param save_interval: updates between two checkpoints; by default ten minutes, and longer where they are large
-        :param trial_episodes: ``planner_trial_episodes`` by default; none are played where there is no environment
+        :param trial_episodes: ``planner_trial_episodes`` by default; none are played where there is no environment, or
+            no expert to compare with
         :param should_stop: asked after every update; where it says so, a checkpoint is written and the training ends
         :raises KeyboardInterrupt: when ``should_stop`` has ended the training
         :raises ValueError: when the buffer is empty, or the checkpoint is of a training with other settings
@@ -361,7 +368,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         if trainer.n_updates > 0:
             self.set_answer("planner")
             n_episodes = self.planner_trial_episodes if trial_episodes is None else trial_episodes
-            if outcome == "done" and n_episodes > 0 and self.env is not None:
+            if outcome == "done" and n_episodes > 0 and self.env is not None and self.has_expert:
                 if self.replay_buffer.dones[: self.replay_buffer.size()].any():
                     training.log(let_the_best_answer(self, n_episodes, progress_bar, should_stop))
                 else:
@@ -380,12 +387,8 @@ class SAID(OfflineAlgorithm, StableSAC):
             return None
         data, env = load_dataset(self.replay_buffer, self.observation_space, self.action_space), self._vec_normalize_env
         if env is not None:  # V reads states as the planner has them
-            is_dict = isinstance(self.observation_space, spaces.Dict)
-            normalized: list[Any] = [
-                env.normalize_obs({"observation": x})["observation"] if is_dict else env.normalize_obs(x)
-                for x in (data.states, data.finals)
-            ]
-            data = replace(data, states=normalized[0], finals=normalized[1])
+            normalized = self.replay_buffer.normalized
+            data = replace(data, states=normalized(data.states, env), finals=normalized(data.finals, env))
         with th.random.fork_rng(devices=[]):
             th.default_generator.manual_seed(self.seed or 0)
             sizes = data.states.shape[1], data.actions.shape[1]
@@ -460,7 +463,7 @@ class SAID(OfflineAlgorithm, StableSAC):
     @contextmanager
     def _as_before_if_it_fails(self) -> Iterator[None]:
         """Take back what a training from logs changes before its first update, if it gets no further."""
-        names = "planner_ways", "replay_buffer", "_replays_logs", "num_timesteps", "value"
+        names = "planner_ways", "replay_buffer", "num_timesteps", "value"
         before, policy = {name: getattr(self, name) for name in names}, self.policy
         values, config = policy.values, policy.planner.config
         try:

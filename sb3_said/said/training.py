@@ -63,7 +63,7 @@ class PlannerTraining:
                     trainer.load_state_dict(state["trainer"])
                     if value_trainer is not None:
                         value_trainer.load_state_dict(state["values"])
-                    restore_evaluations(watcher, state.get("evaluations", []))
+                    restore_evaluations(watcher, state["evaluations"])
                 elif watcher is not None:  # learning from logs, which one training in a folder does
                     raise ValueError("it is of a training on other data; give the same logs, or another folder")
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
-from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 from tqdm.auto import tqdm
 
@@ -16,6 +15,9 @@ from sb3_said.planner.config import SAMPLING_SETTINGS, PlannerConfig
 from sb3_said.sac.policies import settings_of
 
 SAID = Any  # whose module imports this one
+
+CUT_AT = 10  # times the longest stored episode: a good answer may never end one
+NAME_LENGTH = 25  # of a way; SB3's log takes longer ones that begin alike for the same
 
 #: What a trial compares with an agent's own settings: the mean of all candidates, weighed by the critics; the expert's
 #: actor on the present that the planner's first guess has; the default's steps; and a single step. Which is best
@@ -59,6 +61,8 @@ def ways_of(
         can_guess = own.present == "guessed"
         return {name: way for name, way in WAYS.items() if can_guess or way["decided_by"] == "plan"}
     for name, settings in given.items():
+        if len(name) > NAME_LENGTH:
+            raise ValueError(f"planner_ways has the name {name!r}; expected at most {NAME_LENGTH} letters.")
         if name in ("planner", "expert") or not set(settings) <= set(SAMPLING_SETTINGS):
             raise ValueError(
                 f"planner_ways has {name!r}: {settings}; expected another name than 'planner' and 'expert', with "
@@ -117,7 +121,7 @@ def play_trial(
     """
     seed, own = int(np.random.randint(2**31)), model.policy.planner.config
     named = {"planner" if way == own else name: way for name, way in _configs(model).items()} | {"planner": own}
-    can_act = model._n_updates > 0 and 0 in (model.trained_ages or [])
+    can_act = model.has_expert and 0 in (model.trained_ages or [])
     can_act &= model.policy.max_delay > 0  # without delay the actor is the expert
     ways = {name: way for name, way in named.items() if name == "planner" or way.decided_by == "plan" or can_act}
     returns, ages, n_steps = {}, {}, 0
@@ -144,25 +148,29 @@ def _play(
 
     The age of an episode is NaN where it changes.
     """
-    ages: list[list[float]] = [[] for _ in range(env.num_envs)]
-    ended: list[tuple[int, float]] = []  # environment and age of each episode
-    n_calls = np.zeros(env.num_envs, int)  # of each environment, one a step while it has an episode to play
-
-    def on_step(played: dict[str, Any], _: dict[str, Any]) -> None:
-        i, observation = played["i"], played["observations"]
-        n_calls[i] += 1
-        ages[i].append(float(observation["delay"][i, 0]) if isinstance(observation, dict) else 0.0)
-        if played["done"]:
-            settled = ages[i][model.policy.max_delay :] or ages[i][-1:]  # before, the episode is young
-            ended.append((i, settled[0] if len(set(settled)) == 1 else np.nan))
-            ages[i].clear()
-            bar.update()
+    n_envs = env.num_envs
+    to_play = [(n_episodes + i) // n_envs for i in range(n_envs)]  # as evaluate_policy shares them out
+    longest = CUT_AT * (int(model.replay_buffer.steps.max()) + 1)
+    episodes: list[list[tuple[float, float]]] = [[] for _ in range(n_envs)]  # return and age
+    ages: list[list[float]] = [[] for _ in range(n_envs)]
+    sums, n_steps, obs = np.zeros(n_envs), 0, cast(Any, env.reset())
+    while any(len(ended) < n for ended, n in zip(episodes, to_play, strict=True)):
+        for i in range(n_envs):
+            ages[i].append(float(obs["delay"][i, 0]) if isinstance(obs, dict) else 0.0)
+        obs, rewards, dones, infos = env.step(model.predict(obs, deterministic=True)[0])
+        sums, n_steps = sums + rewards, n_steps + n_envs
+        for i in range(n_envs):
+            if dones[i] or len(ages[i]) == longest:
+                settled = ages[i][model.policy.max_delay :] or ages[i][-1:]  # before, the episode is young
+                own = infos[i].get("episode", {}).get("r", sums[i])  # the task's, where a Monitor saw it end
+                if len(episodes[i]) < to_play[i]:
+                    episodes[i].append((float(own), settled[0] if len(set(settled)) == 1 else np.nan))
+                    bar.update()
+                ages[i], sums[i] = [], 0.0
         if should_stop is not None and should_stop():
             raise KeyboardInterrupt
-
-    played: Any = evaluate_policy(model, env, n_episodes, callback=on_step, return_episode_rewards=True, warn=False)
-    order = np.argsort([i for i, _ in ended], kind="stable")
-    return np.asarray(played[0])[order], np.array([age for _, age in ended])[order], env.num_envs * int(n_calls.max())
+    returns, settled_ages = np.array([episode for ended in episodes for episode in ended]).T
+    return returns, settled_ages, n_steps
 
 
 def best_share(planner: np.ndarray, expert: np.ndarray, ages: np.ndarray) -> tuple[float, float, bool]:

@@ -166,6 +166,27 @@ def test_an_agent_of_normalised_observations_is_not_let_into_others_in_silence(t
     assert not model.learn(30).reads_normalized  # of which it has learned by now
 
 
+def test_an_agent_of_observations_as_they_are_is_not_let_into_normalised_ones_in_silence(tmp_path):
+    model, env = make().learn(30), VecNormalize(make_vec_env(delayed), norm_obs_keys=["observation"])
+    model.save(tmp_path / "agent")
+    said = "DelayedSAC learned from observations as they are, and VecNormalize normalises those"
+    with pytest.warns(UserWarning, match=said):
+        loaded = DelayedSAC.load(tmp_path / "agent", env=env)
+    with pytest.warns(UserWarning, match=said):
+        model.set_env(env)
+    assert not (loaded.reads_normalized or model.reads_normalized)
+    assert model.learn(30).reads_normalized
+
+
+@pytest.mark.parametrize("own", [np.int64(3), np.eye(2)[0], "one of many"])
+def test_a_task_s_own_task_id_is_no_name_unless_it_is_text(own, tmp_path):
+    env = Drift()
+    env.task_id = own
+    model = make(env)
+    model.save(tmp_path / "agent")
+    assert DelayedSAC.load(tmp_path / "agent").task == (own if isinstance(own, str) else None)
+
+
 @pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])
 def test_environments_tell_their_task_from_other_processes_too(vec_env_cls):
     def make_env():

@@ -11,7 +11,7 @@ from small_task import Drift, delayed
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_said import DelayedSAC, StableSAC
 from sb3_said.delays.space import UNDELAYED
@@ -144,6 +144,29 @@ def test_the_environment_may_be_played_between_two_calls(make_env, n_episodes, m
     evaluate_policy(model, model.get_env(), n_episodes, warn=False)
     model.learn(30, reset_num_timesteps=False)
     assert len(rows) == 55 and model.replay_buffer.steps[24:26, 0].tolist() == [0, 0]
+    assert_replay_is_what_happened(model, rows)
+
+
+def test_a_reset_between_two_calls_is_seen_at_the_start_of_an_episode_too(monkeypatch):
+    model = make(Drift(), train_freq=(1, "episode"), learning_starts=100)
+    rows = record(model, monkeypatch)
+    model.learn(12)
+    model.get_env().reset()
+    model.learn(12, reset_num_timesteps=False)
+    assert_replay_is_what_happened(model, rows)
+
+
+@pytest.mark.parametrize("rewards", [0.0, ("a", "b")])
+def test_a_task_whose_attributes_have_a_monitors_names_is_none(rewards, monkeypatch):
+    class Named(Drift):
+        total_steps = 200
+
+    Named.rewards = rewards
+    model = make(DummyVecEnv([Named]), learning_starts=100)
+    rows = record(model, monkeypatch)
+    model.learn(25)
+    evaluate_policy(model, model.get_env(), 1, warn=False)
+    model.learn(10, reset_num_timesteps=False)
     assert_replay_is_what_happened(model, rows)
 
 

@@ -160,6 +160,18 @@ def test_after_logs_it_learns_online_from_steps_of_its_own(n_envs):
     assert model.learn(20, reset_num_timesteps=False).replay_buffer.size() * n_envs == 80
 
 
+def test_a_replay_of_logs_is_known_as_such_from_its_file_too(tmp_path):
+    model = learn(make(planner_newest_fraction=0.2), steps=10)
+    model.save(tmp_path / "agent")
+    model.save_replay_buffer(tmp_path / "replay")
+    loaded = SAID.load(tmp_path / "agent", env=delayed(), device="cpu")
+    loaded.load_replay_buffer(tmp_path / "replay")
+    assert len(loaded.make_planner_trainer(1).source) > 0.9 * len(log())
+    with pytest.warns(UserWarning, match="no longer holds the dataset"):
+        loaded.learn(60, reset_num_timesteps=False)
+    assert loaded.num_timesteps == loaded.replay_buffer.size() == 60
+
+
 def test_an_expert_that_has_learned_nothing_is_not_let_answer():
     model = learn()
     for kwargs in ({"who": "expert"}, {"who": "both", "expert_up_to": 1}):

@@ -304,6 +304,15 @@ def test_parameters_and_policy_are_taken_over(trained, tmp_path):
     assert np.array_equal(answer(policy, obs), answer(trained, obs))
 
 
+def test_who_is_given_parameters_has_their_expert(trained):
+    model = make()
+    assert not model.has_expert
+    model.set_parameters(trained.get_parameters())
+    assert model.policy.planner_is_trained and model.has_expert
+    model.set_answer("expert")
+    model.set_planner(decided_by="actor")
+
+
 def test_a_file_brings_its_settings_whatever_the_defaults_are_then(trained, saved, monkeypatch):
     expected, names = trained.policy.planner.config, [field.name for field in fields(PlannerConfig)]
     defaults = list(PlannerConfig.__init__.__defaults__)

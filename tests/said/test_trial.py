@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from small_agent import answer, make, observe
-from small_task import delayed
+from small_task import Drift, delayed
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
@@ -161,6 +161,48 @@ def test_no_trial_waits_for_the_end_of_episodes_that_do_not_end():
     assert model.policy.who_answers == "planner"
 
 
+class Lively(Drift):
+    """Ends by an action near the bounds, which chance takes and no answer does."""
+
+    def step(self, action):
+        state, reward, *_ = super().step(action)
+        return state, reward, bool(abs(action[0]) > 1.9), False, {}
+
+
+def test_an_episode_that_a_good_answer_never_ends_is_cut(monkeypatch):
+    model = make(env=DelayedObservationWrapper(Lively(), 2), learning_starts=60, gradient_steps=1).learn(70)
+    longest = model.replay_buffer.steps.max() + 1
+    monkeypatch.setattr(model, "predict", lambda obs, **_: (np.zeros((1, 1), np.float32), None))
+    found = trial.play_trial(model, n_episodes=2)
+    assert found.returns["planner"].tolist() == [10 * longest] * 2 and found.ages.tolist() == [2, 2]
+
+
+@pytest.mark.parametrize("task", ["Pendulum-v1", "InvertedPendulum-v5"])
+def test_episodes_may_end_above_their_monitor(task):
+    """Where some fall, too, the Monitor sees those end and no others."""
+    env = DelayedObservationWrapper(gym.wrappers.TimeLimit(Monitor(gym.make(task)), 9), 2)
+    found = trial.play_trial(make(env=env).learn(60), n_episodes=5)
+    assert found.n_steps <= 2 * 5 * 9 and {len(returns) for returns in found.returns.values()} == {5}
+    if task == "InvertedPendulum-v5":  # one a step
+        assert all(0 < r <= 9 for returns in found.returns.values() for r in returns)
+
+
+def test_an_expert_without_updates_is_not_tried(monkeypatch):
+    monkeypatch.setattr(trial, "play_trial", lambda *_: pytest.fail("played"))
+    model = make(env=pendulum(), planner_trial_episodes=2, learning_starts=1000).learn(60)
+    assert model.policy.who_answers == "planner"
+
+
+def test_a_monitor_that_allows_no_early_reset_is_none_in_a_trial():
+    env = Monitor(pendulum(), allow_early_resets=False)
+    model = make(env=env, planner_trial_episodes=1).learn(50)
+    assert not env.allow_early_resets
+    assert model.learn(50, reset_num_timesteps=False).num_timesteps == 100
+    env.reset()
+    with pytest.raises(RuntimeError, match="before done"):
+        env.reset()
+
+
 def test_a_trial_can_be_stopped_and_the_planner_stays_trained(monkeypatch):
     monkeypatch.setattr(trainer_module, "GUESS_PASSES", 10_000)  # so that few rows do not end the guess sooner
     model, asked = make(env=pendulum(), planner_ways={}).learn(60), []
@@ -266,6 +308,9 @@ def test_ways_that_are_given_are_checked_and_settings_of_the_users_own_are_kept(
     for wrong in ({"x": {"depth": 4}}, {"expert": {"temperature": 0.1}}, {"x": {"temperature": -1.0}}):
         with pytest.raises(ValueError, match=r"depth|expert|temperature"):
             make(planner_ways=wrong)
+    long = "one_step_weighed_by_critics_"  # two of these would be one row of SB3's log
+    with pytest.raises(ValueError, match="at most 25 letters"):
+        make(planner_ways={long + "a": {"sampling_steps": 1}, long + "b": {"sampling_steps": 2}})
 
 
 @pytest.mark.parametrize(
