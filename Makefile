@@ -40,7 +40,7 @@ $(VENV)/.installed: setup.cfg pyproject.toml constraints.txt scripts/install_tor
 # One decision is too small for two threads, which wait for each other wherever another process is busy.
 train: install
 	log=$$(mktemp) && \
-	$(PY) -u scripts/train.py --algo $(ALGO) --env $(ENV) --delay $(DELAY) --preset $(PRESET) -f $(LOGS) | tee -i $$log; \
+	$(PY) -u scripts/train.py --algo $(ALGO) --env $(ENV) --delay $(DELAY) --preset $(PRESET) -f "$(LOGS)" | tee -i $$log; \
 	run=$$(sed -n 's/^Saving to //p' $$log); rm -f $$log; test -n "$$run" && \
 	$(PY) scripts/evaluate.py "$$run" --episodes $(EPISODES) --num-threads 1 --plot "$$run/evaluation.png"
 

@@ -7,6 +7,8 @@ import itertools
 import math
 import re
 import textwrap
+import warnings
+import zipfile
 from collections.abc import Mapping, Sequence
 from numbers import Integral
 from pathlib import Path
@@ -114,9 +116,13 @@ def plot_learning_curve(run: str | Path, ax: Axes | None = None, window: int = 2
     own = "evaluation of the trained agent" if files[0].is_file() else "evaluation"
     for path, name, color in zip(files, ("evaluation of the expert", own), (COLORS[3], COLORS[4]), strict=True):
         if path.is_file():
-            with np.load(path) as file:
-                known = ~np.isnan(file["results"]).any(axis=1)  # at step 0 there is no planner
-                eval_steps, results = file["timesteps"][known], file["results"][known]
+            try:
+                with np.load(path) as file:
+                    known = ~np.isnan(file["results"]).any(axis=1)  # at step 0 there is no planner
+                    eval_steps, results = file["timesteps"][known], file["results"][known]
+            except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+                warnings.warn(f"{path} is damaged, as a kill leaves it, and left out: {error}.", stacklevel=2)
+                continue
             value, low, high = _bounds([confidence_interval(row) for row in results])
             ax.plot(eval_steps, value, color=color, marker="o", markersize=3, label=f"{name}, 95 % interval")
             ax.fill_between(eval_steps, low, high, color=color, alpha=0.2, linewidth=0)
@@ -276,7 +282,8 @@ def _read_monitors(files: Sequence[Path]) -> tuple[np.ndarray, np.ndarray]:
     ends: list[int] = []
     returns: list[float] = []
     for file in files:
-        rows = list(csv.DictReader(file.read_text().splitlines()[1:]))  # the first line is a JSON comment
+        lines = file.read_text().splitlines()[1:]  # the first one is a JSON comment
+        rows = [row for row in csv.DictReader(lines) if row["r"] and row["l"]]  # a kill may cut the last one
         ends += [len(files) * end for end in itertools.accumulate(int(float(row["l"])) for row in rows)]
         returns += [float(row["r"]) for row in rows]
     order = np.argsort(ends, kind="stable")

@@ -20,8 +20,8 @@ from torch.nn.modules import module as torch_hooks
 from sb3_said.files.archive import SavedFileError
 
 _LARGEST = 2.0**63
-# Where a number outside this range is a mistake or takes memory: names of SB3's off-policy algorithms.
-_RANGES: dict[str, tuple[float, float]] = {
+#: Where a number outside this range is a mistake or takes memory: names of SB3's off-policy algorithms.
+RANGES: dict[str, tuple[float, float]] = {
     "learning_rate": (0, _LARGEST),
     "buffer_size": (1, 1e9),
     "learning_starts": (0, _LARGEST),
@@ -51,7 +51,12 @@ def check_argument(name: str, value: Any, cls: type) -> None:
     hints = (hint for make in constructors for parameter, hint in _hints(make).items() if parameter == name)
     if not _fits(value, next(hints, Any)):
         raise ValueError(f"{name} is {value!r:.100}, which is not of the type that {cls.__name__} declares.")
-    low, high = _RANGES.get(name, (-_LARGEST, _LARGEST))
+    check_range(name, value)
+
+
+def check_range(name: str, value: Any) -> None:
+    """:raises ValueError: for a number, or a ``train_freq`` with its unit, that is out of range"""
+    low, high = RANGES.get(name, (-_LARGEST, _LARGEST))
     number = value[0] if name == "train_freq" and isinstance(value, (tuple, list)) else value
     if isinstance(number, Real) and not low <= float(number) <= high:
         raise ValueError(f"{name} is {value!r:.100}, expected {low:g}..{high:g}.")

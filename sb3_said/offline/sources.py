@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -25,6 +26,7 @@ COLUMNS = {
     "next_observations": ("next_observations", "next_states", "next_obs"),
 }
 TASK = "env"  # entry of an .npz, entry or attribute of an HDF5 file: id of the task, where it says
+MINARI = 'pip install "sb3_said[offline]"' if sys.version_info >= (3, 11) else "it needs Python 3.11, an .npz does not"
 READ = {TASK, *(name for names in COLUMNS.values() for name in names)}
 
 
@@ -163,7 +165,7 @@ def read_minari(source: Any, progress_bar: bool) -> Log:
     try:
         import minari
     except ImportError as error:
-        raise ImportError(f'The dataset {source} needs Minari: pip install "sb3_said[offline]".') from error
+        raise ImportError(f"The dataset {source} needs Minari: {MINARI}.") from error
     if isinstance(source, (str, os.PathLike)):
         try:
             source = minari.load_dataset(os.fspath(source), download=True)

@@ -15,7 +15,7 @@ from sb3_said.delays.space import check_spaces, unscale_action
 from sb3_said.files.atomic import check_writable, replacing
 from sb3_said.offline.datasets import Dataset, is_file
 from sb3_said.offline.scores import reference_returns
-from sb3_said.offline.sources import TASK
+from sb3_said.offline.sources import MINARI, TASK
 
 
 def check_target(target: str | os.PathLike[str]) -> None:
@@ -116,5 +116,5 @@ def _minari() -> Any:
     try:
         import minari
     except ImportError as error:
-        raise ImportError('Minari is missing: pip install "sb3_said[offline]", or write an .npz.') from error
+        raise ImportError(f"Minari is missing: {MINARI}, or write an .npz.") from error
     return minari

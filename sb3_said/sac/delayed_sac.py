@@ -30,6 +30,7 @@ from sb3_said.delays.space import WRAPPER_ORDER, ages_of, check_one_max_delay, c
 from sb3_said.delays.wrapper import DelayedObservationWrapper
 from sb3_said.files.agents import SafeSaveMixin, existing
 from sb3_said.files.archive import load_tree, readable, save_tree
+from sb3_said.files.checks import RANGES, check_range
 from sb3_said.replay.buffer import DelayedReplayBuffer
 from sb3_said.sac.policies import DelayedSACPolicy, as_array
 
@@ -62,8 +63,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
         delays vary, each step teaches the actor what to do under the others too. Measured at delays 0..16
         (results/any_delay_halfcheetah.md); 0 is SADR as published. Under one fixed delay nothing changes
     :param sac_kwargs: every other argument of :class:`stable_baselines3.SAC`
-    :raises ValueError: for other spaces, a ``VecNormalize`` of more than the observation, or options that need another
-        replay buffer (``n_steps`` > 1) or policy
+    :raises ValueError: for other spaces, a ``VecNormalize`` of more than the observation, numbers out of range, or
+        options that need another replay buffer (``n_steps`` > 1) or policy
     :raises TypeError: for an unknown argument
     """
 
@@ -120,6 +121,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
                 f"{name} learns from a DelayedReplayBuffer, got {self.replay_buffer_class.__name__}; "
                 "leave replay_buffer_class out."
             )
+        for setting in RANGES:
+            check_range(setting, getattr(self, setting, None))
         own, given = {*self._policy_flags(), "relabelled_ages"}, {*self.policy_kwargs, *self.replay_buffer_kwargs}
         if twice := sorted(own & given):
             raise ValueError(f"Give {', '.join(twice)} to {name} itself, not in policy_kwargs or replay_buffer_kwargs.")

@@ -12,6 +12,7 @@ import yaml
 
 from sb3_said.files.atomic import write_text
 from sb3_said.files.normalization import normalization_file
+from sb3_said.zoo.folder import TUNED_SETTINGS
 from sb3_said.zoo.record import Record
 
 
@@ -36,13 +37,13 @@ def write_best(run: Path, folder: Path, planner: dict[str, Any], choice: str) ->
     words = ["sb3-said", "train", "--algo", "said", *record.task_words()]
     if record.eval_env_kwargs != record.env_kwargs:  # which the YAML has
         words += ["--eval-env-kwargs", *(f"{name}:{value!r}" for name, value in record.eval_env_kwargs.items())]
-    command = shlex.join([*words, "-conf", str(folder / "best.yml")])
+    command = shlex.join([*words, "-conf", str(folder / TUNED_SETTINGS)])
 
     block, left_out = plain_settings(record)
     lines = [f"{choice}; see results.json.", command]
     lines += [f"Left out, as YAML cannot hold it: {name}" for name in left_out]
     text = "".join(f"# {line}\n" for line in lines) + yaml.safe_dump({record.env: block}, sort_keys=False)
-    write_text(folder / "best.yml", text)
+    write_text(folder / TUNED_SETTINGS, text)
     return command
 
 

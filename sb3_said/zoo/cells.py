@@ -66,13 +66,11 @@ class Results:
     def __init__(self, path: Path, settings: dict[str, Any] | None = None):
         self.path = path
         if settings is None and not path.exists():
-            raise ValueError(f"{path} does not exist, and no runs are given: name the runs to play.")
-        document = _read(path) if path.exists() else {**(settings or {}), "origins": [], "cells": []}
-        self.origins: list[dict[str, Any]] = document.pop("origins")
-        self.cells = [Cell(**entry) for entry in document.pop("cells")]
-        self.settings = document if settings is None else settings
-        if document != self.settings:
-            raise ValueError(f"{path} holds {document}, but {settings} is to be played: give another --json.")
+            raise ValueError(f"{path} does not exist: sb3-said over-delays writes it, where runs to play are named.")
+        found, self.origins, self.cells = _read(path) if path.exists() else (settings or {}, [], [])
+        self.settings = found if settings is None else settings
+        if found != self.settings:
+            raise ValueError(f"{path} holds {found}, but {settings} is to be played: give another --json.")
 
     def ask(self, cells: list[Cell]) -> None:
         """Put these cells first, and fill in known results; drop cells of agents whose file has changed."""
@@ -90,13 +88,14 @@ class Results:
         write_json(self.path, {**self.settings, "origins": self.origins, "cells": cells})
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]], list[Cell]]:
     try:
         document = json.loads(path.read_text())
-        if {"env", "n_episodes", "seed", "origins", "cells"} <= set(document):
-            return dict(document)
-    except (ValueError, TypeError):
-        pass  # no JSON, or a number
+        if {"env", "n_episodes", "seed"} <= set(document):
+            origins, cells = document.pop("origins"), [Cell(**entry) for entry in document.pop("cells")]
+            return document, origins, cells
+    except (ValueError, TypeError, KeyError, AttributeError):
+        pass  # no JSON, or a number; cells of another version
     raise ValueError(f"{path} is no file of over-delays: give another --json.")
 
 

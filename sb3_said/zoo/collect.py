@@ -161,8 +161,8 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(argv)
     with explained(parser):
         check_positive(args, "steps", "n_envs", "num_threads")
-        if min(args.noise) < 0:
-            raise ValueError(f"--noise is a standard deviation, 0 or more, got {min(args.noise)}.")
+        if wrong := [noise for noise in args.noise if not 0 <= noise < math.inf]:
+            raise ValueError(f"--noise is a standard deviation, 0 or more, got {wrong[0]}.")
         check_target(args.output)
         th.set_num_threads(args.num_threads)
         try:

@@ -72,7 +72,9 @@ def opened(args: argparse.Namespace) -> tuple[dict[str, LoadedRun], Path, float]
     :raises ValueError: for an option that cannot work
     """
     check_positive(args, "episodes", "n_envs", "num_threads")
-    if args.period is not None and not (args.realtime and args.period > 0):
+    if args.latency_calls < 0:
+        raise ValueError(f"--latency-calls must be at least 0, got {args.latency_calls}.")
+    if args.period is not None and not (args.realtime and 0 < args.period < math.inf):
         raise ValueError(f"--period takes seconds above 0 and needs --realtime, got {args.period}.")
     th.set_num_threads(args.num_threads)
     if args.plot is not None:

@@ -13,6 +13,8 @@ from sb3_said.files.normalization import normalization_file
 from sb3_said.zoo.answer import BEST_NAME, EXPERT_FOLDER
 from sb3_said.zoo.record import RECORD_NAME, Record
 
+TUNED_NAME, TUNED_SETTINGS = "best.zip", "best.yml"  # what sb3-said tune leaves in its folder
+
 
 def claim_folder(parent: Path, name: str, suffix: str = "") -> Path:
     """Make ``parent/name_K`` with the first free K after the largest there is; of two that ask, each gets its own."""
@@ -80,14 +82,15 @@ def find_agent(path: Path) -> tuple[Path, Record | None]:
         folder = folder.parent if folder.name == EXPERT_FOLDER else folder
         return path, Record.read(folder) if (folder / RECORD_NAME).is_file() else None
     runs = sorted(str(record.parent) for record in path.glob(f"**/{RECORD_NAME}"))
+    runs = [run for run in runs if run == str(path) or not (Path(run) / TUNED_SETTINGS).is_file()]
     if runs and str(path) not in runs:
         raise ValueError(f"{path} is not a run folder: it holds the runs {', '.join(runs)}.")
     record = Record.read(path)
-    names = record.agent_name, BEST_NAME
+    names = record.agent_name, BEST_NAME, TUNED_NAME
     for name in names:
         if (path / name).is_file():
             return path / name, record
-    raise ValueError(f"{path} has no finished agent: neither {names[0]} nor {names[1]}.")
+    raise ValueError(f"{path} has no finished agent: none of {', '.join(names)}.")
 
 
 def find_normalization(file: Path, record: Record | None) -> Path | None:

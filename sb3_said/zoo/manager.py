@@ -122,6 +122,9 @@ class DelayedExperimentManager(ExperimentManager):
                 "Search the expert's settings with --algo sadr -optimize, and the planner's with sb3-said tune on a "
                 "trained run."
             )
+        for option, number in (("n-eval-envs", self.n_eval_envs), ("eval-episodes", self.n_eval_episodes)):
+            if number < 1:
+                raise ValueError(f"--{option} must be at least 1, got {number}.")
         self.run = run
         self.stopping = Stopping()
         self._of_expert = True  # are the environments made now
@@ -129,6 +132,11 @@ class DelayedExperimentManager(ExperimentManager):
         self._uuid = zoo_kwargs.get("uuid_str", "")
         given = self.custom_hyperparams or {}
         if run.resume is not None and run.record is not None:
+            if (evaluates := run.record.options.get("eval_freq", 1) > 0) != (self.eval_freq > 0):
+                raise ValueError(
+                    f"--resume goes on as the run began, {'with' if evaluates else 'without'} evaluations: --eval-freq "
+                    f"{self.eval_freq} does not; leave it out{' or give another above 0' * evaluates}."
+                )
             self.lock = hold_folder(run.resume)
             self._set_folder(run.resume)
             run.record.require(*(set(run.record.missing) - {*given}))
@@ -161,6 +169,9 @@ class DelayedExperimentManager(ExperimentManager):
             of_file = {name: of_file[name] for name in NESTED if name in of_file}
             self.custom_hyperparams = with_given(of_file, given, NESTED)
         hyperparams, saved = super().read_hyperparameters()
+        if self.n_timesteps <= 0 and "n_timesteps" not in hyperparams:
+            raise ValueError(f"{self.config} says no n_timesteps for {self.env_name.gym_id}: add it, or give -n.")
+        hyperparams.setdefault("n_timesteps", self.n_timesteps)
         if self.run.record is not None:  # the run has all of its own, and none of what its YAML holds today
             for settings in (hyperparams, saved):
                 for name in set(settings) - set(self.custom_hyperparams or {}):
@@ -180,6 +191,8 @@ class DelayedExperimentManager(ExperimentManager):
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
         """Preprocess them as rl_zoo3 does; evaluations are of the task as the YAML has it, too."""
         made = super()._preprocess_hyperparams(hyperparams)
+        if self.n_envs < 1:
+            raise ValueError(f"n_envs must be at least 1, got {self.n_envs}.")
         if self._eval_env_kwargs_args is None and self.run.record is None:
             self.eval_env_kwargs = self.env_kwargs
         return made
@@ -189,17 +202,19 @@ class DelayedExperimentManager(ExperimentManager):
 
         :raises SystemExit: for them
         """
-        is_new = self.lock is None
+        is_new, made = self.lock is None, None
         try:
             with ending_training(ValueError, TypeError, AssertionError, ImportError, OSError):
-                return self._set_up()
-        except SystemExit:
-            if is_new and self.lock is not None:
+                made = self._set_up()
+                return made
+        finally:
+            if made is None and is_new and self.lock is not None:  # -optimize, too, writes elsewhere
                 self.release()
                 shutil.rmtree(self.folder)
-            raise
 
     def _set_up(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
+        if self.tensorboard_log:
+            Path(self.tensorboard_log).mkdir(parents=True, exist_ok=True)
         return super().setup_experiment()
 
     def create_envs(self, *args: Any, **kwargs: Any) -> VecEnv:

@@ -80,7 +80,11 @@ def main(argv: list[str] | None = None) -> None:
             plots.check_file(args.plot)  # what cannot be drawn is told now, and not after the episodes
             check_writable(args.plot)
         delays = list(dict.fromkeys(read_name(word) for word in args.delays or ()))
-        shown = play_missing(args, delays) if args.runs else known_cells(args.json, delays)
+        playing = "algo", "env", "episodes", "seed", "device", "gym_packages", "n_envs", "workers"
+        unused = [name.replace("_", "-") for name in playing if getattr(args, name) != parser.get_default(name)]
+        if unused and not args.runs:
+            raise ValueError(f"--{', --'.join(unused)}: without runs to play this has no effect; leave it out.")
+        shown = play_missing(args, delays) if args.runs else known_cells(args, delays)
         rows = choose_rows(args.rows, shown)
     table = make_table(shown, rows)
     order = delays or list(dict.fromkeys(cell.delay for cell in shown))
@@ -124,21 +128,23 @@ def choose_rows(words: list[str] | None, cells: list[Cell]) -> dict[str, str]:
     return rows
 
 
-def known_cells(path: Path, delays: list[int | str]) -> list[Cell]:
-    """Return the cells that a file holds.
+def known_cells(args: argparse.Namespace, delays: list[int | str]) -> list[Cell]:
+    """Return the cells that a file holds of what the command line asks for, all by default.
 
-    :param delays: those of interest, in this order, however the file writes them; all by default
+    :param delays: those of interest, in this order, however the file writes them
     :raises ValueError: without the file, or when it holds nothing of these delays
     """
-    results = Results(path)
+    results = Results(args.json)
     print_settings(results.settings)
-    cells = results.cells
+    cells = [cell for cell in results.cells if not args.answer or cell.answer in (None, args.answer)]
+    cells = [cell for cell in cells if not args.age_errors or cell.age_error in (0, *args.age_errors)]
     if delays:
         pairs = [(delay, cell) for delay in delays for cell in cells]
         same = [(delay, cell) for delay, cell in pairs if make_process(cell.delay) == make_process(delay)]
         cells = [replace(cell, delay=delay) for delay, cell in same]
     if not cells:
-        raise ValueError(f"{path} holds nothing{f' of the delays {delays}' if delays else ''}: name runs to play.")
+        asked = f" of the delays {delays}" if delays else " of what is asked for" if results.cells else ""
+        raise ValueError(f"{args.json} holds nothing{asked}: name runs to play.")
     return cells
 
 

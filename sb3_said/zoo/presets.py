@@ -53,10 +53,15 @@ def preset_overrides(
     :param config: YAML; rl_zoo3 takes Python files, too, which have no presets
     :param max_delay: length of the action history, the largest of ``delay`` by default; a longer one varies, too
     :param dataset: logs to learn from, whose names tell their kind
-    :raises ValueError: for a preset the file does not have
+    :raises ValueError: for a preset the file does not have, and a file that is no YAML of settings
     """
     is_yaml, kind = Path(config).suffix in (".yml", ".yaml"), dataset_kind(dataset)
-    document = (yaml.safe_load(Path(config).read_text()) if is_yaml else None) or {}
+    try:
+        document = (yaml.safe_load(Path(config).read_text()) if is_yaml else None) or {}
+    except yaml.YAMLError as error:
+        raise ValueError(f"{config} is no YAML: {error}") from error
+    if not isinstance(document, dict):
+        raise ValueError(f"{config} holds a {type(document).__name__}, expected settings by task, such as Hopper-v5:.")
     presets = {"cpu": {"default": {}}, **document.get("presets", {})}
     if preset not in presets:
         raise ValueError(f"{config} has no preset '{preset}', only {[*presets]}.")

@@ -15,6 +15,7 @@ import rl_zoo3.train
 from sb3_said.offline import OfflineAlgorithm
 from sb3_said.offline.datasets import is_file
 from sb3_said.zoo.arguments import Delay, add_delay, check_positive, device, explained, make_parser, read_delay
+from sb3_said.zoo.folder import TUNED_SETTINGS
 from sb3_said.zoo.manager import ALGORITHMS, ALGOS, DelayedExperimentManager, Run
 from sb3_said.zoo.offline import OfflineExperimentManager
 from sb3_said.zoo.presets import PRESETS
@@ -131,16 +132,20 @@ def read_command_line(argv: list[str]) -> tuple[Run, str, list[str]]:
         algorithm does not learn from or lacks, or a resume of another task
     """
     options, zoo_argv = own_parser().parse_known_args(argv)
-    zoo_argv = [*joined_settings(zoo_argv), *(["--help"] if options.help else [])]
+    zoo_argv = [*zoo_argv, *(["--help"] if options.help else [])]
     for name in (names[-1] for names in PASSED_ON):
         value = getattr(options, name[2:].replace("-", "_"))
         zoo_argv += [] if value is None else [f"{name}={value}"]
+    if options.num_threads not in (None, -1):
+        check_positive(options, "num_threads")
     if options.num_threads is not None or options.resume is None:  # whose own number stands before
         zoo_argv.append(f"--num-threads={1 if options.num_threads is None else options.num_threads}")
     delay, expert_delay = read_delay(options.delay), read_delay(options.expert_delay)
     check_positive(options, "checkpoint_freq")
     if options.resume is not None:
         record = Record.read(options.resume)
+        if (settings := options.resume / TUNED_SETTINGS).is_file():
+            raise ValueError(f"{options.resume} is what sb3-said tune found, and no training: give -conf {settings}.")
         fixed = {"--algo": options.algo, "--delay": delay, "--expert-delay": expert_delay, "--preset": options.preset}
         fixed |= {"--seed": options.seed, "--env": options.env, "--dataset": options.dataset or None}
         fixed |= of_the_start(zoo_argv)
@@ -148,7 +153,7 @@ def read_command_line(argv: list[str]) -> tuple[Run, str, list[str]]:
             raise ValueError(f"--resume goes on with the run's own {', '.join(given)}: leave them out.")
         freq = record.checkpoint_freq if options.checkpoint_freq is None else options.checkpoint_freq
         run = Run(record.delay, record.preset, freq, options.resume, record.expert_delay, record, record.dataset)
-        return run, record.algo, [*record.command_line(), *zoo_argv]
+        return run, record.algo, joined_settings([*record.command_line(), *zoo_argv])
     algo = options.algo or "said"
     if expert_delay is not None and (algo != "said" or delay is None):
         raise ValueError("--expert-delay needs --algo said and a --delay: an agent without a planner is its expert.")
@@ -157,7 +162,7 @@ def read_command_line(argv: list[str]) -> tuple[Run, str, list[str]]:
     seed = secrets.randbelow(10_000) if options.seed is None or options.seed < 0 else options.seed
     dataset = [os.path.abspath(source) if is_file(source) else source for source in options.dataset]
     run = Run(delay, options.preset or "cpu", options.checkpoint_freq, None, expert_delay, None, dataset)
-    return run, algo, [f"--env={options.env or 'Pendulum-v1'}", f"--seed={seed}", *zoo_argv]
+    return run, algo, joined_settings([f"--env={options.env or 'Pendulum-v1'}", f"--seed={seed}", *zoo_argv])
 
 
 def of_the_start(argv: list[str]) -> dict[str, str | None]:

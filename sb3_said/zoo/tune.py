@@ -25,6 +25,7 @@ from sb3_said.zoo.arguments import TRUST, check_positive, device, explained, mak
 from sb3_said.zoo.best import write_best
 from sb3_said.zoo.depths import DepthPlanners
 from sb3_said.zoo.evaluate import evaluate, print_table
+from sb3_said.zoo.folder import TUNED_NAME, TUNED_SETTINGS
 from sb3_said.zoo.record import Record
 from sb3_said.zoo.runs import LoadedRun, answers, load_run, origin
 from sb3_said.zoo.search import (
@@ -203,7 +204,7 @@ def report(args: argparse.Namespace, run: LoadedRun, study: Study, winner: Froze
             for answer in ("planner", "expert")
             if answer in answers(run.model)
         ]
-    run.model.save(folder / "best.zip")
+    run.model.save(folder / TUNED_NAME)
     trials = [trial_to_dict(trial) for trial in finished(study)]
     choice = f"{', '.join(winner.params)}: the best of {len(trials)} trials, mean return {winner.value:.1f} over "
     choice += f"{args.episodes} episodes; how the planner decides beyond that: as the run does"
@@ -214,7 +215,7 @@ def report(args: argparse.Namespace, run: LoadedRun, study: Study, winner: Froze
         **run.info,
         "settings": study.user_attrs["settings"],
         "trials": trials,
-        "winner": {**trial_to_dict(winner), "agent": str(folder / "best.zip")},
+        "winner": {**trial_to_dict(winner), "agent": str(folder / TUNED_NAME)},
         "report": {**fresh, "deterministic": True, "results": played},
         "origin": origin(run),
     }
@@ -231,7 +232,7 @@ def report(args: argparse.Namespace, run: LoadedRun, study: Study, winner: Froze
     else:
         title = f"{run.info['env']}, delay {run.info['delay']}: mean of {args.episodes} episodes, by setting"
         save_plot(study, folder / "slice.png", title)
-    print(f"Wrote results.json, best.yml and best.zip in {folder}\nTrain with it: {command}")
+    print(f"Wrote results.json, {TUNED_SETTINGS} and {TUNED_NAME} in {folder}\nTrain with it: {command}")
 
 
 def trial_to_dict(trial: FrozenTrial) -> dict[str, Any]:

@@ -204,6 +204,12 @@ def test_environments_tell_their_task_from_other_processes_too(vec_env_cls):
     ("kwargs", "message"),
     [
         ({"n_steps": 3}, "one-step targets"),
+        ({"gamma": 1.5}, "gamma is 1.5, expected 0..1"),
+        ({"gamma": -1}, "gamma is -1"),
+        ({"tau": 5.0}, "tau is 5.0"),
+        ({"batch_size": 0}, "batch_size is 0"),
+        ({"learning_starts": -5}, "learning_starts is -5"),
+        ({"train_freq": (0, "episode")}, "train_freq"),
         ({"replay_buffer_class": DictReplayBuffer}, "DelayedReplayBuffer"),
         ({"optimize_memory_usage": True}, "optimize_memory_usage"),
         ({"policy_kwargs": {"share_features_extractor": True}}, "share_features_extractor"),

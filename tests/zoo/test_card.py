@@ -31,7 +31,7 @@ def test_an_agent_handed_on_and_its_card(run: Path, tmp_path: Path, capsys: pyte
     decide.main([str(run), "--compact", "-o", str(agent)])
     with pytest.raises(SystemExit):
         card.main([str(agent), "--run", str(run), "--returns", str(returns)])
-    assert "name the runs to play" in capsys.readouterr().err
+    assert "where runs to play are named" in capsys.readouterr().err
     delays = ["--delays", "0", "UniformDelay(0, 2)", "--episodes", "3", "--device", "cpu"]
     over_delays.main([f"x={agent}", *delays, "--age-errors", "1", "--json", str(returns)])  # without --env or --algo
     card.main([str(agent), "--run", str(run), "--returns", str(returns), "--latency", "1.5"])

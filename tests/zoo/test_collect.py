@@ -219,6 +219,8 @@ def test_a_normalisation_of_another_task_is_said(tmp_path: Path, capsys: pytest.
         ("{run} -o hopper/mine", "ends in its version: hopper/mine-v0"),
         ("{run} -o {run}/there.npz", "is there already"),
         ("{run} -o {tmp}/x.npz --noise -1", "--noise is a standard deviation"),
+        ("{run} -o {tmp}/x.npz --noise 0 inf", "--noise is a standard deviation, 0 or more, got inf"),
+        ("{run} -o {tmp}/x.npz --noise nan", "--noise is a standard deviation"),
         ("{run} -o {tmp}/x.npz --steps 0", "--steps must be at least 1"),
         ("{run} random -o {tmp}/x.npz --steps 1", "fewer than there are shares, 2"),
         ("random -o {tmp}/x.npz", "of no task: give --env"),

@@ -176,6 +176,8 @@ def test_an_agent_of_sb3_itself_is_not_opened(run: Path, tmp_path: Path) -> None
         (["--algo", "nonsense"], "give --algo"),
         (["--period", "0.02"], "needs --realtime"),
         (["--realtime", "--period", "0"], "above 0"),
+        (["--realtime", "--period", "inf"], "above 0"),
+        (["--latency-calls", "-1"], "--latency-calls must be at least 0, got -1"),
         (["--json", "."], "it is a folder. Give the path of a file"),
         (["--plot", "plot.xyz"], "give it the suffix .png"),
         (["--seed", "-5"], "a reset seed is a whole number, 0 or more, got -5"),
@@ -224,6 +226,17 @@ def test_the_curves_of_runs_below_a_folder_are_not_its_own(tmp_path: Path) -> No
     summary = Summary.from_episodes("planner", np.ones(3), np.ones(3, np.int64))
     evaluate.draw(tmp_path / "x.png", [summary], tmp_path, "a bare file")
     assert (tmp_path / "x.png").is_file()
+
+
+def test_logs_that_a_kill_has_cut_are_drawn_as_far_as_they_go(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    np.savez(tmp_path / "evaluations.npz", timesteps=np.arange(50), results=np.ones((50, 2)))
+    os.truncate(tmp_path / "evaluations.npz", 300)
+    (tmp_path / "0.monitor.csv").write_text('#{"t_start": 0}\nr,l,t\n5.0,12,1.0\n7.0,13,2.0\n8.0')
+    with pytest.warns(UserWarning, match=r"evaluations\.npz is damaged"):
+        ax = evaluate.plots.plot_learning_curve(tmp_path)
+    (episodes, _) = ax.get_lines()
+    np.testing.assert_array_equal(episodes.get_xydata(), [[12, 5], [25, 7]])
 
 
 def test_paths_that_hold_no_agent(run: Path, tmp_path: Path) -> None:

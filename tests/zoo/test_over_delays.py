@@ -199,10 +199,33 @@ def test_without_runs_what_was_played_is_shown(
     assert "--delays is missing" in capsys.readouterr().err
 
 
-def test_what_was_played_is_shown_where_nothing_can_be_written(sadr: Path, tmp_path: Path, monkeypatch) -> None:
-    play(tmp_path / "out.json", [sadr], ["1"])
+def test_what_was_played_is_shown_where_nothing_can_be_written(sadr: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+    document = play(tmp_path / "out.json", [sadr], ["1"])
     monkeypatch.setattr(over_delays, "check_writable", lambda path: pytest.fail(f"{path} is to be written"))
+    capsys.readouterr()
     over_delays.main(["--json", str(tmp_path / "out.json")])
+    mean = np.mean(document["cells"][0]["result"]["returns"])
+    assert f"| {document['cells'][0]['agent']} |" in (out := capsys.readouterr().out) and f"{mean:,.1f}" in out
+
+
+def test_what_is_shown_is_what_was_asked_for(said: Path, tmp_path: Path, capsys) -> None:
+    file = tmp_path / "out.json"
+    play(file, [f"a={said}"], ["1"], "--age-errors", "-1", "1")
+    capsys.readouterr()
+    over_delays.main(["--json", str(file), "--answer", "expert", "--age-errors", "1"])
+    out = capsys.readouterr().out
+    assert "a expert" in out and "age +1" in out and "planner" not in out and "age -1" not in out
+    with pytest.raises(SystemExit):
+        over_delays.main(["--json", str(file), "--episodes", "7", "--workers", "2"])
+    assert "--episodes, --workers: without runs to play this has no effect" in capsys.readouterr().err
+
+
+def test_cells_of_another_version_are_told_in_one_line(tmp_path: Path, capsys) -> None:
+    document = {"env": ENV, "n_episodes": 2, "seed": 3, "origins": [], "cells": [{"x": 1}]}
+    (tmp_path / "other.json").write_text(json.dumps(document))
+    with pytest.raises(SystemExit):
+        over_delays.main(["--json", str(tmp_path / "other.json")])
+    assert "is no file of over-delays" in capsys.readouterr().err
 
 
 def test_a_changed_agent_is_played_again(said: Path, tmp_path: Path, monkeypatch) -> None:

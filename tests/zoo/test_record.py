@@ -147,6 +147,12 @@ def test_a_resume_keeps_the_number_of_threads_unless_told(run: Path) -> None:
         assert parser.parse_known_args(words)[0].num_threads == n_threads
 
 
+def test_a_resume_imports_packages_beside_the_run_s_own(run: Path) -> None:
+    forge(run, gym_packages=["json"])
+    words = train.read_command_line(["--resume", str(run), "--gym-packages", "csv"])[2]
+    assert words[words.index("--gym-packages") :] == ["--gym-packages", "json", "csv"]
+
+
 @pytest.mark.parametrize("words", ["--delay 3", "--algo sadr", "--env Hopper-v5", "--env=Hopper-v5", "--preset paper"])
 def test_a_resume_has_the_runs_own_task(words: str, run: Path) -> None:
     with pytest.raises(ValueError, match=rf"goes on with the run's own {words[:5]}.*: leave them out"):

@@ -184,13 +184,19 @@ def test_a_resume_takes_no_setting_that_the_run_never_had(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize(
     ("words", "message"),
-    [("--eval-freq -1", "had 1 EvalCallback"), ("-params planner_gradient_steps:11", "gradient_steps was 10")],
+    [
+        ("--eval-freq -1", "as the run began, with evaluations: --eval-freq -1 does not"),
+        ("-params planner_gradient_steps:11", "gradient_steps was 10"),
+    ],
 )
-def test_a_refused_resume_leaves_the_run_as_it_was(words: str, message: str, finished: Path, tmp_path: Path) -> None:
+def test_a_refused_resume_leaves_the_run_as_it_was(
+    words: str, message: str, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     copy = Path(shutil.copytree(finished, tmp_path / "copy"))
     before = json.loads((copy / "run.json").read_text())
-    with pytest.raises(SystemExit, match=message):
+    with pytest.raises(SystemExit) as stop:
         train.main(["--resume", str(copy), *words.split()])
+    assert message in f"{stop.value} {capsys.readouterr().err}"
     assert json.loads((copy / "run.json").read_text()) == before
     train.main(["--resume", str(copy)])
     assert_same_agents(finished, copy)
@@ -329,9 +335,16 @@ def test_the_expert_can_learn_under_another_delay(tmp_path: Path, monkeypatch: p
         ("--n-timesteps -7", "got -7"),
         ("--device gpu", "auto, cpu, cuda or another that torch has, got gpu"),
         ("-params gamma:nine", "name 'nine' is not defined"),
+        ("--n-eval-envs 0", "--n-eval-envs must be at least 1, got 0"),
+        ("--eval-episodes 0", "--eval-episodes must be at least 1, got 0"),
+        ("--num-threads 0", "--num-threads must be at least 1, got 0"),
+        ("-conf {}/broken.yml", "broken.yml is no YAML"),
+        ("-conf {}/list.yml", "list.yml holds a list, expected settings by task"),
     ],
 )
 def test_says_what_is_wrong(words: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "broken.yml").write_text("a: [1")
+    (tmp_path / "list.yml").write_text("- a")
     with pytest.raises(SystemExit) as stop:
         train.main(["--env", "Pendulum-v1", "-f", str(tmp_path), *words.format(tmp_path).split()])
     assert stop.value.code == 2 and message in capsys.readouterr().err
@@ -345,6 +358,11 @@ def test_says_what_is_wrong(words: str, message: str, tmp_path: Path, capsys: py
         ("--delay 2 -params normalize:True", "norm_obs_keys"),
         ("--env CartPole-v1", "action space"),
         ("--algo sadr -params planner_gradient_steps:3", "has no argument planner_gradient_steps"),
+        ("-params gamma:2", "gamma is 2, expected 0..1"),
+        ("-params batch_size:0", "batch_size is 0"),
+        ("-params train_freq:0", "train_freq is 0"),
+        ("-params n_envs:0", "n_envs must be at least 1, got 0"),
+        ("-tb /dev/null/x", "/dev/null"),
     ],
 )
 def test_settings_that_do_not_fit_are_said_and_leave_no_folder(words: str, message: str, tmp_path: Path) -> None:
@@ -352,6 +370,22 @@ def test_settings_that_do_not_fit_are_said_and_leave_no_folder(words: str, messa
         train.main(["--env", "Pendulum-v1", "-f", str(tmp_path), "--verbose", "0", *words.split()])
     assert [file for file in tmp_path.rglob("*") if file.is_file()] == []
     assert not [*tmp_path.glob("*/*")]
+
+
+def test_a_file_without_steps_needs_them_on_the_command_line(tmp_path: Path) -> None:
+    block = {"policy": "MlpPolicy", "learning_starts": 50, "buffer_size": 100}
+    (tmp_path / "own.yml").write_text(yaml.safe_dump({"Pendulum-v1": block}))
+    words = ["--algo", "sadr", "--env", "Pendulum-v1", "-conf", str(tmp_path / "own.yml"), "-f", str(tmp_path)]
+    with pytest.raises(SystemExit, match=r"own\.yml says no n_timesteps for Pendulum-v1: add it, or give -n"):
+        train.main(words)
+    train.main([*words, "-n", "60", "--seed", "1", "--verbose", "0"])
+    assert DelayedSAC.load(tmp_path / "sadr" / "Pendulum-v1-seed1_1" / "Pendulum-v1").num_timesteps == 60
+
+
+def test_a_search_of_rl_zoo3_leaves_no_folder_of_a_run(tmp_path: Path) -> None:
+    search = "-optimize --n-trials 1 --n-startup-trials 0 --n-evaluations 1 --n-eval-envs 1 -params buffer_size:100"
+    train_here(tmp_path, f"--algo sadr --env Pendulum-v1 --seed 1 -n 20 {search}")
+    assert not [*tmp_path.rglob("*_1")]
 
 
 def test_a_resume_takes_no_option_of_the_start(

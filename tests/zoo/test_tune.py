@@ -23,7 +23,7 @@ from sb3_said import SAID, PlannerConfig
 from sb3_said.files.archive import load_tree
 from sb3_said.files.checkpoint import CHECKPOINT_NAME
 from sb3_said.planner.config import SAMPLING_SETTINGS
-from sb3_said.zoo import tune
+from sb3_said.zoo import train, tune
 from sb3_said.zoo.arguments import read_delay
 from sb3_said.zoo.best import plain_settings
 from sb3_said.zoo.record import Record
@@ -98,6 +98,9 @@ def test_a_search_from_grid_to_report(
     assert sorted(seeds) == sorted([*(4 * [*range(20_000, 20_004)]), *(2 * [*range(10_000, 10_003)])])
     assert results["winner"]["sampling_steps"] == 2 != PlannerConfig().sampling_steps
     check_report(run)
+    assert load_run(run / "tune", device="cpu").info["file"] == str(run / "tune" / "best.zip")
+    with pytest.raises(ValueError, match=r"what sb3-said tune found, and no training: give -conf .*best\.yml"):
+        train.read_command_line(["--resume", str(run / "tune")])
 
     # The same command again makes nothing twice, and still says what was found.
     seeds.clear()
