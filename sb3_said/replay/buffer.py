@@ -227,6 +227,7 @@ class DelayedReplayBuffer(ReplayBuffer):
         self.ends[:] = False
         self.tails.clear()
         self._expected = None
+        self.holds_logs = False
 
     # ------------------------------------------------------------------------------------------------ sampling
 

@@ -56,6 +56,7 @@ def check_stored(buffer: Any, state: dict[str, Any]) -> None:
         "ages": np.all((ages >= 0) & (ages <= buffer.max_delay)),
         "steps": np.all(state["steps"] >= 0),
         "dones or timeouts": np.all((flags == 0) | (flags == 1)),
+        "holds_logs": type(state["holds_logs"]) is bool,
     }.items():
         if not is_so:
             raise ValueError(f"The stored {what} are none that a DelayedReplayBuffer has.")

@@ -629,6 +629,7 @@ def test_a_single_action_is_not_broadcast_over_many():
         ("pos", lambda pos: -1),
         ("pos", lambda pos: float(pos)),
         ("full", lambda full: 1),
+        ("holds_logs", lambda holds: 0),
         ("observations", lambda x: np.where(x == x, np.nan, x)),
         ("observations", lambda x: x.astype(np.float64)),
         ("rewards", lambda x: x + np.float32(np.inf)),
