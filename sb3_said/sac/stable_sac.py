@@ -44,8 +44,8 @@ class StableSAC(DelayedSAC):
     :param ent_coef: SAC's, in units of scaled rewards
     :param target_entropy: SAC's; ``"half"`` is -act_dim / 2, ``"auto"`` is -act_dim
     :param critic_layer_norm: a LayerNorm follows each hidden layer of the critics, which bear ``gradient_steps=2`` with
-        it (DroQ, https://arxiv.org/abs/2110.02034). HalfCheetah-v5, whose episodes do not end by a fall, learns about
-        twice as fast with it; Hopper-v5 does not, and Walker2d-v5 falls for longer (results/stable_expert.md)
+        it (DroQ, https://arxiv.org/abs/2110.02034). HalfCheetah-v5, whose episodes do not end by a fall, learns
+        faster with it; Hopper-v5 does not, and Walker2d-v5 falls for longer (results/stable_expert.md)
     :param sac_kwargs: every other argument of :class:`DelayedSAC`
     :raises ValueError: as ``DelayedSAC`` does, and for a ``policy_delay`` or an ``actor_averaging`` out of range
     """
