@@ -295,13 +295,13 @@ class DelayedSAC(SafeSaveMixin, SAC):
         self._note_task()
         if self.trained_ages is not None and learned_normalized != self.reads_normalized:
             self.reads_normalized = learned_normalized  # until it learns here
-            how, remedy = (
-                ("that VecNormalize had normalised, and those of this environment are not",
-                 "give it load_normalization(path, venv), or SB3's VecNormalize.load")
-                if learned_normalized
-                else ("as they are, and VecNormalize normalises those of this environment", "leave it out")
-            )  # fmt: skip
-            warnings.warn(f"This {type(self).__name__} learned from observations {how}: {remedy}.", stacklevel=3)
+            told = "as they are, and VecNormalize normalises those of this environment: leave it out."
+            if learned_normalized:
+                told = (
+                    "that VecNormalize had normalised, and those of this environment are not: give it "
+                    "load_normalization(path, venv), or SB3's VecNormalize.load."
+                )
+            warnings.warn(f"This {type(self).__name__} learned from observations {told}", stacklevel=3)
 
     def check_ages(self, ages: list[int]) -> None:
         """Warn where an agent is to act on observations of ages that it has not met in training, amid episodes.

@@ -136,8 +136,12 @@ def known_cells(args: argparse.Namespace, delays: list[int | str]) -> list[Cell]
     """
     results = Results(args.json)
     print_settings(results.settings)
-    cells = [cell for cell in results.cells if not args.answer or cell.answer in (None, args.answer)]
-    cells = [cell for cell in cells if not args.age_errors or cell.age_error in (0, *args.age_errors)]
+    cells = [
+        cell
+        for cell in results.cells
+        if (not args.answer or cell.answer in (None, args.answer))
+        and (not args.age_errors or cell.age_error in (0, *args.age_errors))
+    ]
     if delays:
         pairs = [(delay, cell) for delay in delays for cell in cells]
         same = [(delay, cell) for delay, cell in pairs if make_process(cell.delay) == make_process(delay)]

@@ -22,7 +22,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_said import DelayedSAC, __version__
+from sb3_said import SAID, DelayedSAC, __version__
 from sb3_said.delays import DelayProcess, FixedDelay
 from sb3_said.delays.space import ages_of, has_state_history
 from sb3_said.evaluation.rollout import Observation, Rollout, rollout
@@ -181,10 +181,11 @@ def delay_name(process: DelayProcess) -> int | str:
 def answers(model: BaseAlgorithm) -> list[str | None]:
     """Return who can answer in a SAID agent; None for another agent alone.
 
-    An expert that made no update, as after learning from logs, answers only where there is nobody else.
+    An expert that has learned nothing, as after learning from logs, answers only where there is nobody else.
     """
-    found: list[str | None] = list(getattr(model.policy, "answers", [None]))
-    return [who for who in found if who != "expert" or model._n_updates > 0] or found
+    if not isinstance(model, SAID):
+        return [None]
+    return [who for who in model.policy.answers if who != "expert" or model.has_expert] or [*model.policy.answers]
 
 
 def answering(model: BaseAlgorithm, answer: str | None, at_once: bool = False) -> AbstractContextManager[Any]:

@@ -136,7 +136,7 @@ def read_command_line(argv: list[str]) -> tuple[Run, str, list[str]]:
     for name in (names[-1] for names in PASSED_ON):
         value = getattr(options, name[2:].replace("-", "_"))
         zoo_argv += [] if value is None else [f"{name}={value}"]
-    if options.num_threads not in (None, -1):
+    if options.num_threads != -1:
         check_positive(options, "num_threads")
     if options.num_threads is not None or options.resume is None:  # whose own number stands before
         zoo_argv.append(f"--num-threads={1 if options.num_threads is None else options.num_threads}")
