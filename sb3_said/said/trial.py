@@ -153,7 +153,7 @@ def _play(
     longest = CUT_AT * (int(model.replay_buffer.steps.max()) + 1)
     episodes: list[list[tuple[float, float]]] = [[] for _ in range(n_envs)]  # return and age
     ages: list[list[float]] = [[] for _ in range(n_envs)]
-    sums, n_steps, obs = np.zeros(n_envs), 0, cast(Any, env.reset())
+    sums, was_cut, n_steps, obs = np.zeros(n_envs), [False] * n_envs, 0, cast(Any, env.reset())
     while any(len(ended) < n for ended, n in zip(episodes, to_play, strict=True)):
         for i in range(n_envs):
             ages[i].append(float(obs["delay"][i, 0]) if isinstance(obs, dict) else 0.0)
@@ -162,11 +162,12 @@ def _play(
         for i in range(n_envs):
             if dones[i] or len(ages[i]) == longest:
                 settled = ages[i][model.policy.max_delay :] or ages[i][-1:]  # before, the episode is young
-                own = infos[i].get("episode", {}).get("r", sums[i])  # the task's, where a Monitor saw it end
+                seen = {} if was_cut[i] else infos[i].get("episode", {})  # by a Monitor, which knows of no cut
+                own = seen.get("r", sums[i])
                 if len(episodes[i]) < to_play[i]:
                     episodes[i].append((float(own), settled[0] if len(set(settled)) == 1 else np.nan))
                     bar.update()
-                ages[i], sums[i] = [], 0.0
+                ages[i], sums[i], was_cut[i] = [], 0.0, not dones[i]
         if should_stop is not None and should_stop():
             raise KeyboardInterrupt
     returns, settled_ages = np.array([episode for ended in episodes for episode in ended]).T

@@ -1,6 +1,7 @@
 """The trial after the planner's training: it measures what evaluate_policy does, and the better one answers."""
 
 import csv
+import itertools
 import warnings
 
 import gymnasium as gym
@@ -175,6 +176,20 @@ def test_an_episode_that_a_good_answer_never_ends_is_cut(monkeypatch):
     monkeypatch.setattr(model, "predict", lambda obs, **_: (np.zeros((1, 1), np.float32), None))
     found = trial.play_trial(model, n_episodes=2)
     assert found.returns["planner"].tolist() == [10 * longest] * 2 and found.ages.tolist() == [2, 2]
+
+
+def test_what_is_left_of_a_cut_episode_does_not_count_it_again(monkeypatch):
+    """Its Monitor does, which has seen one episode."""
+    env = Monitor(DelayedObservationWrapper(Lively(), 2))
+    model = make(env=env, learning_starts=60, gradient_steps=1).learn(70)
+    longest, n_answers = int(model.replay_buffer.steps.max()) + 1, itertools.count(1)
+
+    def predict(obs, **_):  # ends an episode three steps after the cut
+        return np.full((1, 1), next(n_answers) % (10 * longest + 3) == 0, np.float32) * 2, None
+
+    monkeypatch.setattr(model, "predict", predict)
+    found = trial.play_trial(model, n_episodes=3)
+    assert found.returns["planner"].tolist() == [10 * longest, 3, 10 * longest]
 
 
 @pytest.mark.parametrize("task", ["Pendulum-v1", "InvertedPendulum-v5"])
