@@ -80,6 +80,9 @@ class TrainingCheckpointCallback(BaseCallback):
         self._tried_at = self.model.num_timesteps
         self._saved_at = self._tried_at if self.path.exists() else -1
         self._clock.wait()
+        assert isinstance(self.model, SafeSaveMixin)
+        if self._saved_at < 0 and self.keeps_replay and _replay_buffer(self.model).size() > 0:
+            self.save()  # a resume makes an agent anew, and has the replay that this one was given from nowhere else
 
     def _on_rollout_start(self) -> None:
         # Here, and not in on_step, the replay buffer holds every step taken and the updates have caught up with it.
@@ -190,7 +193,7 @@ def evaluations_of(callback: BaseCallback | None) -> list[dict[str, Any]]:
 def restore_evaluations(callback: BaseCallback | None, saved: list[dict[str, Any]]) -> None:
     """Give each ``EvalCallback`` what :func:`evaluations_of` returned.
 
-    :raises ValueError: for another number of them
+    :raises ValueError: for another number of them, or of their episodes
     :raises SavedFileError: for evaluations other than an EvalCallback's
     """
     eval_callbacks = _eval_callbacks(callback)
@@ -199,8 +202,14 @@ def restore_evaluations(callback: BaseCallback | None, saved: list[dict[str, Any
             f"the run had {len(saved)} EvalCallback and is resumed with {len(eval_callbacks)}; resume with the "
             "callbacks of the run"
         )
-    for kept in saved:
+    for eval_callback, kept in zip(eval_callbacks, saved, strict=True):
         _check_evaluation(kept)
+        n_episodes = {np.size(returns) for returns in kept["evaluations_results"]}
+        if n_episodes - {eval_callback.n_eval_episodes}:  # its file, one array of all, could not be written
+            raise ValueError(
+                f"the run's evaluations are of {', '.join(map(str, n_episodes))} episodes and it is resumed with "
+                f"{eval_callback.n_eval_episodes}; resume with as many as before"
+            )
     for eval_callback, kept in zip(eval_callbacks, saved, strict=True):
         for name in _EVALUATION:
             setattr(eval_callback, name, kept[name])

@@ -189,6 +189,16 @@ class SAID(OfflineAlgorithm, StableSAC):
         with self.policy.preferring_who_answers():
             super().save(path, compact)
 
+    @classmethod
+    def load(cls: type[SelfSAID], path: PathOrFile, *args: Any, **kwargs: Any) -> SelfSAID:  # type: ignore[override]
+        """Build an agent from a file, as :meth:`DelayedSAC.load` does.
+
+        As in the constructor, ``planner_kwargs`` that say how to decide leave a later ``learn`` no ways to try.
+        """
+        if set(SAMPLING_SETTINGS) & set(kwargs.get("planner_kwargs") or {}):
+            kwargs = {"planner_ways": {}, **kwargs}
+        return super().load(path, *args, **kwargs)
+
     def set_planner(self, **settings: Any) -> None:
         """Change how the planner answers, also after training or loading; ``save`` keeps the change.
 

@@ -108,7 +108,7 @@ def check_scored(settings: dict[str, Any], is_by_state: bool) -> None:
 def play_trial(
     model: SAID, n_episodes: int, progress_bar: bool = False, should_stop: Callable[[], bool] | None = None
 ) -> Trial:
-    """Play the training environment with the planner, in each of its ways, and with the expert, from the same seed.
+    """Play the training environment with the planner, in each of its ways, and with the expert, from the same seeds.
 
     These are environment steps beyond those of ``learn``. An expert that has not learned at age 0, as one of a fixed
     delay, does not try to act on a guessed present.
@@ -129,11 +129,10 @@ def play_trial(
         with model.borrowed_env() as env:
             for name, config in {**ways, "expert": own}.items():
                 model.policy.planner.config = config
-                env.seed(seed)
                 who = "expert" if name == "expert" else "planner"
                 bar = tqdm(total=n_episodes, desc=name, disable=not progress_bar)
                 with bar, model.policy.answering(who, at_once=True):
-                    returns[name], ages[name], n_played = _play(model, env, n_episodes, bar, should_stop)
+                    returns[name], ages[name], n_played = _play(model, env, n_episodes, seed, bar, should_stop)
                 n_steps += n_played
     finally:
         model.policy.planner.config = own
@@ -142,35 +141,32 @@ def play_trial(
 
 
 def _play(
-    model: SAID, env: VecEnv, n_episodes: int, bar: tqdm, should_stop: Callable[[], bool] | None
+    model: SAID, env: VecEnv, n_episodes: int, seed: int, bar: tqdm, should_stop: Callable[[], bool] | None
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return the episodes' returns and ages, by environment and not by whose ended first, and the steps taken.
+    """Return the returns and ages of the episodes from the resets seed, seed + 1, ..., and the steps taken.
 
-    The age of an episode is NaN where it changes.
+    Each environment plays one at a time and waits for the longest. The age of an episode is NaN where it changes.
     """
-    n_envs = env.num_envs
-    to_play = [(n_episodes + i) // n_envs for i in range(n_envs)]  # as evaluate_policy shares them out
+    returns, settled_ages, n_steps = np.zeros(n_episodes), np.zeros(n_episodes), 0
     longest = CUT_AT * (int(model.replay_buffer.steps.max()) + 1)
-    episodes: list[list[tuple[float, float]]] = [[] for _ in range(n_envs)]  # return and age
-    ages: list[list[float]] = [[] for _ in range(n_envs)]
-    sums, was_cut, n_steps, obs = np.zeros(n_envs), [False] * n_envs, 0, cast(Any, env.reset())
-    while any(len(ended) < n for ended, n in zip(episodes, to_play, strict=True)):
-        for i in range(n_envs):
-            ages[i].append(float(obs["delay"][i, 0]) if isinstance(obs, dict) else 0.0)
-        obs, rewards, dones, infos = env.step(model.predict(obs, deterministic=True)[0])
-        sums, n_steps = sums + rewards, n_steps + n_envs
-        for i in range(n_envs):
-            if dones[i] or len(ages[i]) == longest:
-                settled = ages[i][model.policy.max_delay :] or ages[i][-1:]  # before, the episode is young
-                seen = {} if was_cut[i] else infos[i].get("episode", {})  # by a Monitor, which knows of no cut
-                own = seen.get("r", sums[i])
-                if len(episodes[i]) < to_play[i]:
-                    episodes[i].append((float(own), settled[0] if len(set(settled)) == 1 else np.nan))
-                    bar.update()
-                ages[i], sums[i], was_cut[i] = [], 0.0, not dones[i]
-        if should_stop is not None and should_stop():
-            raise KeyboardInterrupt
-    returns, settled_ages = np.array([episode for ended in episodes for episode in ended]).T
+    for first in range(0, n_episodes, env.num_envs):
+        env.seed(seed + first)  # of each environment one more than of that before it
+        obs, ages = cast(Any, env.reset()), []
+        sums = np.zeros(env.num_envs)
+        is_played = first + np.arange(env.num_envs) < n_episodes
+        while is_played.any():
+            ages.append(obs["delay"][:, 0] if isinstance(obs, dict) else sums * 0)  # (n_envs,)
+            obs, rewards, dones, infos = env.step(model.predict(obs, deterministic=True)[0])
+            sums, n_steps = sums + rewards, n_steps + env.num_envs
+            for i in np.flatnonzero(is_played & (dones | (len(ages) == longest))):
+                returns[first + i] = infos[i].get("episode", {}).get("r", sums[i])  # the task's, where a Monitor saw it
+                met = np.stack(ages)[:, i]
+                met = met[model.policy.max_delay :] if len(met) > model.policy.max_delay else met[-1:]  # no young ones
+                settled_ages[first + i] = met[0] if np.all(met == met[0]) else np.nan
+                is_played[i] = False
+                bar.update()
+            if should_stop is not None and should_stop():
+                raise KeyboardInterrupt
     return returns, settled_ages, n_steps
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import math
 import sys
@@ -65,18 +66,18 @@ class Episode:
     terminated: bool = False
     seed: int = 0
     """of its reset"""
-    is_whole: bool = True
-    """not cut off"""
+    is_whole: bool = False
+    """it has ended, and was not cut off"""
 
     def cut(self, n_steps: int) -> Episode:
         """Return the first steps of it."""
-        is_whole = n_steps >= len(self.rewards)
+        is_whole = self.is_whole and n_steps >= len(self.rewards)
         kept = self.states[: n_steps + 1], self.actions[:n_steps], self.rewards[:n_steps]
         return Episode(*kept, self.terminated and is_whole, self.seed, is_whole)
 
 
 class Recorder(gym.Wrapper[Any, Any, Any, Any]):
-    """Adds each episode that ends to a list, with the true states of a delayed task.
+    """Adds each episode that begins to a list, with the true states of a delayed task.
 
     :param on_step: called after each step
     """
@@ -88,6 +89,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(**kwargs)
         self.episode = Episode([true_state(observation, info)], seed=kwargs.get("seed") or 0)
+        self.episodes.append(self.episode)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -98,9 +100,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         self.episode.states.append(true_state(observation, info))
         self.episode.actions.append(np.asarray(executed, np.float32))
         self.episode.rewards.append(float(reward))
-        if terminated or truncated:
-            self.episode.terminated = terminated
-            self.episodes.append(self.episode)
+        self.episode.terminated, self.episode.is_whole = terminated, terminated or truncated
         if self.on_step is not None:
             self.on_step()
         return observation, reward, terminated, truncated, info
@@ -133,6 +133,10 @@ class NoisyAgent:
         action, state = self.model.predict(observation, state=state, **how)
         drawn = self.rng.normal(size=action.shape) * self.noise * (high - low) / 2
         return np.clip(action + drawn, low, high).astype(low.dtype), state
+
+
+class ShareIsFull(Exception):
+    """Ends a play before its episodes end, which some never do."""
 
 
 @dataclass(frozen=True)
@@ -270,6 +274,8 @@ def play(share: Share, n_steps: int, seed: int, n_envs: int, deterministic: bool
     def on_step() -> None:
         if bar.n < full:  # steps of the last episodes are cut off
             bar.update()
+        if bar.n == full and n_settled(episodes) >= left:
+            raise ShareIsFull
 
     def make_env() -> gym.Env[Any, Any]:
         return Recorder(share.run.make_env(), episodes, on_step)
@@ -282,7 +288,7 @@ def play(share: Share, n_steps: int, seed: int, n_envs: int, deterministic: bool
     while left > 0:
         lengths = [len(episode.rewards) for episode in kept]
         n_episodes = max(n_envs, math.ceil(left / np.mean(lengths))) if lengths else n_envs
-        with answering(share.run.model, who, at_once=True):
+        with answering(share.run.model, who, at_once=True), contextlib.suppress(ShareIsFull):
             player.play(n_episodes, seed + used, n_envs, deterministic=deterministic)
         used += n_episodes
         for episode in sorted(episodes, key=lambda episode: episode.seed):  # short ones end first
@@ -291,6 +297,16 @@ def play(share: Share, n_steps: int, seed: int, n_envs: int, deterministic: bool
                 left -= len(kept[-1].rewards)
         episodes.clear()
     return kept
+
+
+def n_settled(episodes: list[Episode]) -> int:
+    """Return the number of steps that will be kept whatever comes: in the order of seeds, up to who still plays."""
+    n_steps = 0
+    for episode in sorted(episodes, key=lambda episode: episode.seed):
+        n_steps += len(episode.rewards)
+        if not episode.is_whole:
+            break
+    return n_steps
 
 
 def join(episodes: list[Episode]) -> Dataset:

@@ -424,6 +424,21 @@ def test_evaluations_must_be_those_of_the_run(tmp_path):
     path = run_and_kill(make(), tmp_path, callbacks=[evaluation(tmp_path)])
     with pytest.raises(ValueError, match=r"had 1 EvalCallback and is resumed with 0"):
         restore_training(make(), path)
+    longer = evaluation(tmp_path)
+    longer.n_eval_episodes = 3
+    with pytest.raises(ValueError, match=r"are of 2 episodes and it is resumed with 3; resume with as many"):
+        restore_training(make(), path, longer)
+    assert longer.evaluations_results == []
+
+
+def test_a_replay_that_an_agent_begins_with_is_kept_at_once(tmp_path):
+    make().learn(60).save_replay_buffer(tmp_path / "replay_buffer.pkl")
+    model = make()
+    model.load_replay_buffer(tmp_path / "replay_buffer.pkl")
+    path = run_and_kill(model, tmp_path, at=1)
+    resumed = make()
+    restore_training(resumed, path)
+    assert resumed.num_timesteps == 0 and resumed.replay_buffer.size() == 60
 
 
 def test_other_replay_buffers_are_refused():

@@ -16,6 +16,7 @@ pytest.importorskip("rl_zoo3")
 
 from logged_task import LoggedTask
 from small_run import ENV, write_run
+from small_task import Drift
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
@@ -113,6 +114,14 @@ def test_a_cut_episode_is_no_terminal_and_keeps_the_state_after_it(run: Path, tm
     np.testing.assert_array_equal(cut.finals[0], whole.states[length - 1])
     assert whole.terminated[length - 1]
     assert json.loads(str(np.load(tmp_path / "cut.npz")["about"]))["shares"][0]["mean_return"] is None
+
+
+def test_an_episode_that_never_ends_is_cut(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(gym.registry, "Endless-v0", gym.envs.registration.EnvSpec("Endless-v0", lambda: Drift(10**9)))
+    words = "random", "--env", "Endless-v0", "--steps", "50", "--n-envs", "3", "--device", "cpu"
+    collect.main([*words, "-o", str(tmp_path / "endless.npz")])
+    data = load_dataset(tmp_path / "endless.npz", Drift.observation_space, Drift.action_space, "Endless-v0")
+    assert data.ends.tolist() == [False] * 49 + [True] and not data.terminated.any()
 
 
 def test_a_place_that_cannot_be_written_is_told_before_any_step(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
