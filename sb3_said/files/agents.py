@@ -187,6 +187,8 @@ class SafeSaveMixin(OffPolicyAlgorithm):
     ) -> None:
         """Take over networks and optimizers from state dicts, as SB3 does, or from a file of :meth:`save`.
 
+        Settings stay this agent's own, also those of ``SAID.set_planner``.
+
         :param exact_match: refuse parameters that lack a part; False takes those that are given
         :raises SavedFileError: if the file cannot be read or does not fit
         """

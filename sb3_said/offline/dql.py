@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -268,8 +270,7 @@ class DQL(OfflineAlgorithm):
     def _setup_lr_schedule(self) -> None:
         super()._setup_lr_schedule()
         if self.lr_decay:
-            given = self.lr_schedule
-            self.lr_schedule = lambda remaining: given(remaining) * 0.5 * (1.0 - math.cos(math.pi * remaining))
+            self.lr_schedule = partial(_falling, self.lr_schedule)
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
         """Make gradient steps on batches of the replay buffer."""
@@ -323,3 +324,8 @@ class DQL(OfflineAlgorithm):
         if self.policy.config.max_grad_norm is not None:
             nn.utils.clip_grad_norm_(network.parameters(), self.policy.config.max_grad_norm)
         network.optimizer.step()
+
+
+def _falling(rate: Callable[[float], float], remaining: float) -> float:
+    """Return a rate times a cosine's fall from 1 to 0; no lambda, which could not be pickled."""
+    return rate(remaining) * 0.5 * (1.0 - math.cos(math.pi * remaining))

@@ -360,6 +360,12 @@ class SAID(OfflineAlgorithm, StableSAC):
         :raises ValueError: when the buffer is empty, or the checkpoint is of a training with other settings
         :raises FloatingPointError: when an update was not finite
         """
+        if not self.has_expert and 0 < self.num_timesteps <= self.learning_starts:
+            warnings.warn(
+                f"The expert has not learned yet: after {self.num_timesteps} steps, of which the first learning_starts="
+                f"{self.learning_starts} are random actions, the planner imitates those. Learn for longer.",
+                stacklevel=2,
+            )
         if not hasattr(self, "_logger"):  # not set_logger: learn() makes its own
             self._logger = configure_logger(self.verbose, self.tensorboard_log, "SAID", reset_num_timesteps=False)
 

@@ -1,5 +1,7 @@
 """Diffusion Q-learning against closed forms: the schedule, the sampler, Q's target, two modes, and a better mode."""
 
+import pickle
+
 import numpy as np
 import pytest
 import torch as th
@@ -223,7 +225,8 @@ def test_the_rate_falls_to_0_by_a_cosine(lr_decay, monkeypatch, tmp_path):
     expected = 0.05 * (1 + np.cos(np.pi * np.arange(10) / 10)) if lr_decay else np.full(10, 0.1)
     np.testing.assert_allclose(rates, np.tile(expected.repeat(2), 2))  # of critics and actor
     model.save(tmp_path / "dql.zip")
-    assert DQL.load(tmp_path / "dql.zip", device="cpu").lr_schedule(0.5) == pytest.approx(0.05 if lr_decay else 0.1)
+    for again in (DQL.load(tmp_path / "dql.zip", device="cpu"), pickle.loads(pickle.dumps(model))):
+        assert again.lr_schedule(0.5) == pytest.approx(0.05 if lr_decay else 0.1)
 
 
 @pytest.mark.parametrize("delay", [None, 2])

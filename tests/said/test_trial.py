@@ -234,7 +234,8 @@ def test_episodes_may_end_above_their_monitor(task):
 
 def test_an_expert_without_updates_is_not_tried(monkeypatch):
     monkeypatch.setattr(trial, "play_trial", lambda *_: pytest.fail("played"))
-    model = make(env=pendulum(), planner_trial_episodes=2, learning_starts=1000).learn(60)
+    with pytest.warns(UserWarning, match="after 60 steps, of which the first learning_starts=1000 are random actions"):
+        model = make(env=pendulum(), planner_trial_episodes=2, learning_starts=1000).learn(60)
     assert model.policy.who_answers == "planner"
 
 
