@@ -137,10 +137,10 @@ class DelayedExperimentManager(ExperimentManager):
                     f"--resume goes on as the run began, {'with' if evaluates else 'without'} evaluations: --eval-freq "
                     f"{self.eval_freq} does not; leave it out{' or give another above 0' * evaluates}."
                 )
-            self.lock = hold_folder(run.resume)
-            self._set_folder(run.resume)
             run.record.require(*(set(run.record.missing) - {*given}))
             run.record.check_hyperparams()
+            self.lock = hold_folder(run.resume)  # once nothing can fail: who has no manager cannot let go of it
+            self._set_folder(run.resume)
             self.custom_hyperparams = with_given(run.record.hyperparams, given, NESTED)
             self.env_kwargs = {**run.record.env_kwargs, **self.env_kwargs}
             self.eval_env_kwargs = {**run.record.eval_env_kwargs, **self.eval_env_kwargs}
