@@ -20,7 +20,8 @@ class Draws:
 
     def __init__(self, process: DelayProcess, rng: np.random.Generator):
         self.process, self.rng, self.n_drawn = process, rng, 0
-        self._began = copy.deepcopy(rng.bit_generator.__getstate__())  # with the count of its children
+        bits: Any = rng.bit_generator  # whose type does not tell of pickling in every NumPy
+        self._began = copy.deepcopy(bits.__getstate__())  # with the count of its children
         self._delays = packet_delays(process, rng)
 
     def __next__(self) -> int | None:
@@ -32,7 +33,8 @@ class Draws:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        self.rng.bit_generator.__setstate__(copy.deepcopy(self._began))  # type: ignore[attr-defined]  # as in pickles
+        bits: Any = self.rng.bit_generator
+        bits.__setstate__(copy.deepcopy(self._began))  # as in pickles
         self._delays = packet_delays(self.process, self.rng)
         for _ in range(self.n_drawn):
             next(self._delays)

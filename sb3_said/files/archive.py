@@ -239,7 +239,8 @@ def _read_array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
     with archive.open(name) as member:
         if np.lib.format.read_magic(member) != (1, 0):
             raise SavedFileError(f"{name} is of another version of NumPy's format than 1.0")
-        shape, _, dtype = np.lib.format.read_array_header_1_0(member, max_header_size=_MAX_HEADER)
+        read_header: Any = np.lib.format.read_array_header_1_0  # whose type lacks max_header_size in NumPy 2.2
+        shape, _, dtype = read_header(member, max_header_size=_MAX_HEADER)
         _check_dtype(dtype)  # a stranger's bytes as object pointers would be an attack
         n_bytes = member.tell() + math.prod(shape) * dtype.itemsize
         if min(shape, default=0) < 0 or n_bytes != archive.getinfo(name).file_size:

@@ -129,7 +129,8 @@ class NoisyAgent:
         low, high = self.space.low, self.space.high
         if self.model is None:
             n = len(next(iter(observation.values())) if isinstance(observation, dict) else observation)
-            return self.rng.uniform(low, high, (n, *low.shape)).astype(low.dtype), None
+            drawn = self.rng.uniform(size=(n, *low.shape)) * (high - low) + low
+            return drawn.astype(low.dtype), None
         action, state = self.model.predict(observation, state=state, **how)
         drawn = self.rng.normal(size=action.shape) * self.noise * (high - low) / 2
         return np.clip(action + drawn, low, high).astype(low.dtype), state

@@ -430,7 +430,8 @@ def memory_per_transition(delay, episode_length, n_steps=1000):
 def test_memory_for_ant(episode_length):
     at_16 = memory_per_transition(16, episode_length)
     assert at_16 <= 550  # 0.55 GB per million
-    assert at_16 == memory_per_transition(0, episode_length)
+    at_0 = memory_per_transition(0, episode_length)
+    assert at_16 == pytest.approx(at_0, abs=0.1)  # Python 3.10's number 0 is 4 bytes smaller than any other
 
 
 def test_tails_go_with_their_rows():

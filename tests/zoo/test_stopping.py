@@ -167,9 +167,11 @@ def test_ctrl_c_reaches_a_training_whose_environments_are_processes(tmp_path: Pa
         start_new_session=True, env={**os.environ, "PYTHONPATH": str(SCRIPT.parents[1])},
     )  # fmt: skip
     deadline = time.monotonic() + 120
-    while time.monotonic() < deadline and not list(tmp_path.glob("said/*/progress.csv")):
+    while time.monotonic() < deadline and not any(
+        len(file.read_text().splitlines()) > 2
+        for file in tmp_path.glob("said/*/*.monitor.csv")  # below the header
+    ):
         time.sleep(0.1)
-    time.sleep(0.5)
     os.killpg(process.pid, signal.SIGINT)
     shown = process.communicate(timeout=120)[0]
     assert process.returncode == 130 and "and wrote a checkpoint" in shown, shown
