@@ -74,7 +74,7 @@ class DiTBlock(nn.Module):
 
 
 class DiT1d(nn.Module):
-    """Predict the clean window, the noise or a mixture from a noisy window whose known entries are clean.
+    """Predict v or the noise of a noisy window whose known entries are clean, or what a prior of it is off by.
 
     A call has three parts, because two of them do not change from one denoising step or candidate to the next:
     :meth:`modulations` depends on the time alone, :meth:`context` on what is known alone, :meth:`forward` on both.

@@ -106,15 +106,15 @@ def fit_first_guess(
     scheduler = th.optim.lr_scheduler.CosineAnnealingLR(optimizer, n_updates)
     for _ in tqdm(range(n_updates), desc="first guess", disable=not progress_bar):
         windows = source.sample(GUESS_BATCH_SIZE, 2, generator, config.early_probability)
-        states, actions, follows, values = windows
+        states, actions, valid, values = windows
         states = normalizer.normalize_states(states)
         loss = guess.clone_loss(states[:, 0], actions[:, 0], window_weight(values, config.weight_factor))
         if older is not None:
             half = GUESS_BATCH_SIZE // 2
             old = older.sample(half, 2, generator, config.early_probability)
             states = th.cat([states[:half], normalizer.normalize_states(old.states)])
-            actions, follows = th.cat([actions[:half], old.actions]), th.cat([follows[:half], old.valid])
-        loss = loss + guess.model.loss(states, actions[:, 0], follows[:, 1])
+            actions, valid = th.cat([actions[:half], old.actions]), th.cat([valid[:half], old.valid])
+        loss = loss + guess.model.loss(states, actions[:, 0], valid[:, 1])
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

@@ -29,7 +29,7 @@ class Plan(NamedTuple):
     """Candidate plans for B decisions, in environment units."""
 
     action: th.Tensor  # (B, act_dim), in [-1, 1]: the best candidate's action at the decision index, or their mean
-    present: th.Tensor  # (B, obs_dim): s_t as the candidates decode it, their mean
+    present: th.Tensor  # (B, obs_dim): s_t, the mean of what the candidates decode, or the first guess's
     states: th.Tensor  # (B, N, L, obs_dim), L the largest delay of the decisions plus the horizon
     actions: th.Tensor  # (B, N, L, act_dim), in [-1, 1]
     values: th.Tensor  # (B, N), the scores they were chosen or weighed by

@@ -30,8 +30,8 @@ Value = Literal["critics", "iql"]
 class SAIDPolicy(DelayedSACPolicy):
     """The expert's policy with an inpainting planner on top.
 
-    Until the planner is trained the expert answers; after that the planner does, scored by the expert's critics, unless
-    :meth:`set_answer` says otherwise.
+    Until the planner is trained the expert answers, then whoever :meth:`set_answer` names; training names the planner.
+    At a temperature above 0 the expert's critics, or V(s), score its candidates.
 
     :param planner_kwargs: fields of :class:`~sb3_said.planner.PlannerConfig`
     :param value: who values planned states: ``"critics"``, the expert's, by min Q(s, a); or ``"iql"``, a V(s) of its

@@ -323,7 +323,6 @@ class SAID(OfflineAlgorithm, StableSAC):
     @th.no_grad()
     def _stored_values(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """Return values as the environment's rewards would sum up, of states as windows have them: (B,)."""
-        self.critic.set_training_mode(False)  # until the next update; batch norm must not learn from this
         values = self.policy.q_value(states.to(self.device), actions.to(self.device)).cpu()
         env = self._vec_normalize_env
         return values if env is None else th.from_numpy(env.unnormalize_reward(values.numpy()))
@@ -360,7 +359,8 @@ class SAID(OfflineAlgorithm, StableSAC):
         :raises ValueError: when the buffer is empty, or the checkpoint is of a training with other settings
         :raises FloatingPointError: when an update was not finite
         """
-        if not self.has_expert and 0 < self.num_timesteps <= self.learning_starts:
+        learned_online = not self.replay_buffer.holds_logs  # of logs num_timesteps counts updates
+        if learned_online and not self.has_expert and 0 < self.num_timesteps <= self.learning_starts:
             warnings.warn(
                 f"The expert has not learned yet: after {self.num_timesteps} steps, of which the first learning_starts="
                 f"{self.learning_starts} are random actions, the planner imitates those. Learn for longer.",

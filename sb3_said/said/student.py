@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from tqdm.auto import tqdm
 
 from sb3_said.delays.space import KEYS, check_spaces
-from sb3_said.planner.plain import ZScored
+from sb3_said.planner.plain import ZScored, plain_network
 from sb3_said.sac.extractors import StateAugmentedExtractor
 from sb3_said.sac.policies import as_array
 
@@ -73,8 +73,7 @@ class Student(ZScored):
         super().__init__(n_inputs)
         self.width, self.max_delay, self.reader = width, max_delay, reader
         self.register_buffer("preferred", th.zeros(()))  # 1: it answers
-        hidden = nn.Linear(n_inputs, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU()
-        self.network = nn.Sequential(*hidden, nn.Linear(width, act_dim), nn.Tanh())
+        self.network = nn.Sequential(*plain_network(n_inputs, act_dim, width), nn.Tanh())
 
     def read(self, observation: PyTorchObs) -> th.Tensor:
         """Return what it reads: (B, n_inputs)."""

@@ -88,6 +88,14 @@ def test_a_number_of_updates_may_be_written_as_a_float():
         make().learn_offline(None, 2.5)
 
 
+def test_another_training_on_a_log_is_not_taken_for_one_on_random_actions():
+    model = make().learn_offline(log(), 3)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="The expert has not learned")
+        model.train_planner()
+    assert model.policy.planner_updates > 0
+
+
 def test_no_other_settings_of_v_are_taken():
     with pytest.raises(ValueError, match=r"IQL has no setting tau; it has expectile, hidden, .*updates"):
         make(iql_kwargs={"tau": 0.9})
