@@ -190,7 +190,9 @@ class SAID(OfflineAlgorithm, StableSAC):
             super().save(path, compact)
 
     @classmethod
-    def load(cls: type[SelfSAID], path: PathOrFile, *args: Any, **kwargs: Any) -> SelfSAID:  # type: ignore[override]
+    def load(  # type: ignore[override]  # of files, too, that are open
+        cls: type[SelfSAID], path: PathOrFile, *args: Any, **kwargs: Any
+    ) -> SelfSAID:
         """Build an agent from a file, as :meth:`DelayedSAC.load` does.
 
         As in the constructor, ``planner_kwargs`` that say how to decide leave a later ``learn`` no ways to try.

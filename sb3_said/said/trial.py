@@ -155,14 +155,14 @@ def _play(
         sums = np.zeros(env.num_envs)
         is_played = first + np.arange(env.num_envs) < n_episodes
         while is_played.any():
-            ages.append(obs["delay"][:, 0] if isinstance(obs, dict) else sums * 0)  # (n_envs,)
+            ages.append(obs["delay"][:, 0] if isinstance(obs, dict) else np.zeros(env.num_envs))
             obs, rewards, dones, infos = env.step(model.predict(obs, deterministic=True)[0])
             sums, n_steps = sums + rewards, n_steps + env.num_envs
             for i in np.flatnonzero(is_played & (dones | (len(ages) == longest))):
                 returns[first + i] = infos[i].get("episode", {}).get("r", sums[i])  # the task's, where a Monitor saw it
-                met = np.stack(ages)[:, i]
-                met = met[model.policy.max_delay :] if len(met) > model.policy.max_delay else met[-1:]  # no young ones
-                settled_ages[first + i] = met[0] if np.all(met == met[0]) else np.nan
+                young = min(model.policy.max_delay, len(ages) - 1)  # steps in which the episode is
+                settled = np.stack(ages)[young:, i]
+                settled_ages[first + i] = settled[0] if np.all(settled == settled[0]) else np.nan
                 is_played[i] = False
                 bar.update()
             if should_stop is not None and should_stop():

@@ -77,7 +77,7 @@ class Episode:
 
 
 class Recorder(gym.Wrapper[Any, Any, Any, Any]):
-    """Adds each episode that begins to a list, with the true states of a delayed task.
+    """Adds each episode to a list when it begins, so in the order of seeds, with the true states of a delayed task.
 
     :param on_step: called after each step
     """
@@ -292,7 +292,7 @@ def play(share: Share, n_steps: int, seed: int, n_envs: int, deterministic: bool
         with answering(share.run.model, who, at_once=True), contextlib.suppress(ShareIsFull):
             player.play(n_episodes, seed + used, n_envs, deterministic=deterministic)
         used += n_episodes
-        for episode in sorted(episodes, key=lambda episode: episode.seed):  # short ones end first
+        for episode in episodes:
             if left > 0:
                 kept.append(episode.cut(left))
                 left -= len(kept[-1].rewards)
@@ -301,9 +301,9 @@ def play(share: Share, n_steps: int, seed: int, n_envs: int, deterministic: bool
 
 
 def n_settled(episodes: list[Episode]) -> int:
-    """Return the number of steps that will be kept whatever comes: in the order of seeds, up to who still plays."""
+    """Return the number of steps that will be kept whatever comes: in the order they began, up to who still plays."""
     n_steps = 0
-    for episode in sorted(episodes, key=lambda episode: episode.seed):
+    for episode in episodes:
         n_steps += len(episode.rewards)
         if not episode.is_whole:
             break

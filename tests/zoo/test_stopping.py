@@ -167,10 +167,10 @@ def test_ctrl_c_reaches_a_training_whose_environments_are_processes(tmp_path: Pa
         start_new_session=True, env={**os.environ, "PYTHONPATH": str(SCRIPT.parents[1])},
     )  # fmt: skip
     deadline = time.monotonic() + 120
-    while time.monotonic() < deadline and not any(
-        len(file.read_text().splitlines()) > 2
-        for file in tmp_path.glob("said/*/*.monitor.csv")  # below the header
-    ):
+    while time.monotonic() < deadline:
+        logs = tmp_path.glob("said/*/*.monitor.csv")
+        if any(len(log.read_text().splitlines()) > 2 for log in logs):  # an episode below the header: it learns
+            break
         time.sleep(0.1)
     os.killpg(process.pid, signal.SIGINT)
     shown = process.communicate(timeout=120)[0]
