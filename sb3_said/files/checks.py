@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import functools
 import inspect
 import math
 import threading
@@ -83,18 +84,14 @@ def check_numbers(where: str, node: Any) -> None:
         raise ValueError(f"{where} holds {array!s:.100}, expected finite numbers.")
 
 
+@functools.cache
 def _hints(make: Callable[..., Any]) -> dict[str, Any]:
     """Return the types of a constructor's arguments, and none where its module does not know them at run time."""
-    if make not in _known_hints:
-        try:
-            parameters = inspect.signature(make, eval_str=True).parameters
-        except NameError:
-            parameters = types.MappingProxyType({})
-        _known_hints[make] = {name: parameter.annotation for name, parameter in parameters.items()}
-    return _known_hints[make]
-
-
-_known_hints: dict[Callable[..., Any], dict[str, Any]] = {}
+    try:
+        parameters = inspect.signature(make, eval_str=True).parameters
+    except NameError:
+        return {}
+    return {name: parameter.annotation for name, parameter in parameters.items()}
 
 
 def _fits(value: Any, hint: Any) -> bool:

@@ -182,7 +182,7 @@ class DQLPolicy(DelayedSACPolicy):
         self.actor_target.set_training_mode(False)
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> DiffusionActor:
-        features_extractor = features_extractor or self._extractor(self.actor_kwargs, "observation")
+        features_extractor = features_extractor or self._extractor("observation")
         kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
         return DiffusionActor(self.config, **kwargs).to(self.device)
 

@@ -239,10 +239,8 @@ class InpaintingPlanner(nn.Module):
             that the network was not trained with
         """
         config, device = self.config, self.device
-        observation = finite_tensor("observation", observation, (None, self.obs_dim), device)
-        n = len(observation)
-        action_history = finite_tensor("action_history", action_history, (n, self.max_delay, self.act_dim), device)
-        delay = self._trained_delay(checked_delay(delay, n, self.max_delay).to(device), action_history)
+        observation, action_history, delay = self._checked(observation, action_history, delay)
+        n, delay = len(observation), self._trained_delay(delay, action_history)
         extra_states: tuple[th.Tensor, ...] = ()
         if config.extra_state_probability > 0:
             shape = (n, self.max_delay, self.obs_dim)
@@ -305,16 +303,25 @@ class InpaintingPlanner(nn.Module):
         """
         if self.first_guess is None:
             raise ValueError("This planner has no first guess; build it with another first_guess than 'none'.")
-        observation = finite_tensor("observation", observation, (None, self.obs_dim), self.device)
-        n = len(observation)
-        action_history = finite_tensor("action_history", action_history, (n, self.max_delay, self.act_dim), self.device)
-        delay = checked_delay(delay, n, self.max_delay).to(self.device)
+        observation, action_history, delay = self._checked(observation, action_history, delay)
         length = int(delay.max()) + self.config.horizon
         given = inpainting.known_window(observation, action_history, delay, length)
         known = inpainting.known_mask(delay, length, self.obs_dim, self.act_dim)
         states, actions = self._guess_window(given, known, delay)
-        rows = th.arange(n, device=self.device)
+        rows = th.arange(len(delay), device=self.device)
         return states[rows, delay], actions[rows, delay]
+
+    def _checked(
+        self, observation: th.Tensor, action_history: th.Tensor, delay: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """Return what :meth:`plan` and :meth:`guess` are given, on the planner's device.
+
+        :raises ValueError: for wrong shapes, numbers that are not finite, or delays outside 0..max_delay
+        """
+        observation = finite_tensor("observation", observation, (None, self.obs_dim), self.device)
+        n = len(observation)
+        action_history = finite_tensor("action_history", action_history, (n, self.max_delay, self.act_dim), self.device)
+        return observation, action_history, checked_delay(delay, n, self.max_delay).to(self.device)
 
     def _can_be_recorded(self, value_fn: ValueFn | None) -> bool:
         return self.device.type == "cuda" and (value_fn is None or isinstance(_owner(value_fn), nn.Module))

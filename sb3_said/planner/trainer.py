@@ -124,7 +124,7 @@ class PlannerTrainer:
         training_source, held_source = source.split(held_out, seed) if held_out > 0 else (source, None)
         values = scaled_values(training_source.values, self.config.value_scale)
         self.source = replace(training_source, values=values).to(self.device)
-        self.older = None if older is None else older.to(self.device)
+        self.older = older
         sizes = planner.obs_dim, planner.act_dim, planner.max_delay
         with th.random.fork_rng(devices=[]):  # initial weights are the only draws that take no generator
             th.default_generator.manual_seed(seed)  # th.manual_seed would seed GPUs, too
@@ -133,7 +133,7 @@ class PlannerTrainer:
         windows = self.source.sample(N_NORMALIZER_WINDOWS, planner.window_length, self.generator)
         self.average.fit_normalizer(self.source.start_states(), self.source.start_actions(), windows)
         self.online = copy.deepcopy(self.average).train().requires_grad_(True)
-        fused: dict[str, Any] = {"fused": on_gpu or self.device.type == "cpu", "capturable": on_gpu}
+        fused: dict[str, Any] = {"fused": True, "capturable": on_gpu}
         self.optimizer = th.optim.AdamW(
             self.online.network.parameters(),
             lr=self._rate(self.config.learning_rate),
@@ -184,7 +184,7 @@ class PlannerTrainer:
         :param should_stop: asked after every update; where it says so, this trainer is of no use any more
         :return: whether there is one, or none is asked for; False where ``should_stop`` has ended it
         """
-        guess = self.online.first_guess
+        guess, older, self.older = self.online.first_guess, self.older, None  # older: another copy of the replay
         if guess is None or self.n_updates > 0 or self._has_guessed:
             return True
         passes = -(-GUESS_PASSES * len(self.source) // GUESS_BATCH_SIZE)
@@ -198,13 +198,11 @@ class PlannerTrainer:
             self.generator,
             progress_bar=progress_bar,
             should_stop=should_stop,
-            older=self.older,
+            older=None if older is None else older.to(self.device),
         ):
             return False
-        self.older = None  # which on a GPU is another copy of the replay
         guess.requires_grad_(False)
-        if self.online.prior is not None:
-            self.online.fit_prior(self.source.sample(N_PRIOR_WINDOWS, self.online.window_length, self.generator))
+        self.online.fit_prior(self.source.sample(N_PRIOR_WINDOWS, self.online.window_length, self.generator))
         self.average.load_state_dict(self.online.state_dict())
         self._has_guessed = True
         return True
@@ -342,7 +340,7 @@ class PlannerTrainer:
 
     def _check_finite(self) -> None:
         bad = int(self._bad_update)
-        if bad < 0 and not th.stack(th._foreach_norm(self._averaged)).isfinite().all():
+        if bad < 0 and not th.nn.utils.get_total_norm(self._averaged).isfinite():
             bad = self.n_updates - 1  # its gradient, and no loss came after it
         if bad >= 0:
             raise FloatingPointError(

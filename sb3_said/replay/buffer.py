@@ -327,8 +327,8 @@ class DelayedReplayBuffer(ReplayBuffer):
         self, obs: dict[str, np.ndarray], states: np.ndarray, env: VecNormalize | None
     ) -> dict[str, th.Tensor]:
         if env is not None:
-            states = env.normalize_obs({**obs, "observation": states})["observation"]
-            obs = env.normalize_obs(obs)  # type: ignore[assignment]  # a dict for a dict
+            states = self.normalized(states, env)
+            obs = {**obs, "observation": self.normalized(obs["observation"], env)}
         return {key: self.to_torch(value) for key, value in {**obs, UNDELAYED: states}.items()}
 
     # ------------------------------------------------------------------------------------------------ windows

@@ -128,11 +128,11 @@ class DelayedSAC(SafeSaveMixin, SAC):
             raise ValueError(f"Give {', '.join(twice)} to {name} itself, not in policy_kwargs or replay_buffer_kwargs.")
         if self.env is not None:
             self._check_env(self.env)
-        user_kwargs = self.policy_kwargs, self.replay_buffer_kwargs
-        self.policy_kwargs = {**self.policy_kwargs, **self._policy_flags()}
-        self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "relabelled_ages": self.relabelled_ages}
+        if self.replay_buffer is None:
+            self.replay_buffer = self._new_replay_buffer()
+        users, self.policy_kwargs = self.policy_kwargs, {**self.policy_kwargs, **self._policy_flags()}
         super()._setup_model()
-        self.policy_kwargs, self.replay_buffer_kwargs = user_kwargs
+        self.policy_kwargs = users
         self._note_task()
 
     def _note_task(self) -> None:
@@ -223,20 +223,16 @@ class DelayedSAC(SafeSaveMixin, SAC):
 
     def _sample_action(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, np.ndarray]:
         if self._last_obs is None:  # a callback has played the environment, as a trial does
-            self._begin_episodes()
+            assert self.env is not None
+            self._last_obs = self.env.reset()  # type: ignore[assignment]  # as SB3 does where learning begins
+            self._last_episode_starts = np.ones((self.env.num_envs,), dtype=bool)
+            if self._vec_normalize_env is not None:
+                self._last_original_obs = self._vec_normalize_env.get_original_obs()
         return super()._sample_action(*args, **kwargs)
 
     def _store_transition(self, *args: Any, **kwargs: Any) -> None:
         if self._last_obs is not None:  # else a callback has played at this very step, whose observation is gone
             super()._store_transition(*args, **kwargs)
-
-    def _begin_episodes(self) -> None:
-        """Reset the environments, as SB3 does where learning begins."""
-        assert self.env is not None
-        self._last_obs = self.env.reset()  # type: ignore[assignment]  # as in SB3
-        self._last_episode_starts = np.ones((self.env.num_envs,), dtype=bool)
-        if self._vec_normalize_env is not None:
-            self._last_original_obs = self._vec_normalize_env.get_original_obs()
 
     @contextmanager
     def borrowed_env(self) -> Iterator[VecEnv]:
@@ -310,13 +306,18 @@ class DelayedSAC(SafeSaveMixin, SAC):
 
         :param ages: that it will meet, in control steps (see :func:`ages_of`)
         """
-        if self.trained_ages is not None and (unmet := sorted(set(ages) - set(self.trained_ages))):
+        acts_at = self._acts_at(ages)
+        if self.trained_ages is not None and (unmet := sorted(set(acts_at) - set(self.trained_ages))):
             warnings.warn(
                 f"This {type(self).__name__} learned at ages {written_ages(self.trained_ages)} and is given "
                 f"{written_ages(unmet)}: what it does at ages it has not met is undefined. Train it on a range, such "
                 "as delay=(0, 8), or give it the delay it knows.",
                 stacklevel=3,
             )
+
+    def _acts_at(self, ages: list[int]) -> list[int]:
+        """Return the ages that the actor meets, of those that the agent does."""
+        return ages
 
     def predict(
         self,
@@ -344,6 +345,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
             self.action_space,
             self.device,
             self.n_envs,
+            self.optimize_memory_usage,
             relabelled_ages=self.relabelled_ages,
             **self.replay_buffer_kwargs,
         )

@@ -86,6 +86,8 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         if self.normalise_states:
             state_space = check_spaces(self.observation_space, self.action_space).state
             self.state_normalizer = StateNormalizer(state_space.shape[0])
+        if self.replay_space is not None:  # actor and critics are shown what is sampled
+            self.actor_kwargs["observation_space"] = self.critic_kwargs["observation_space"] = self.replay_space
         super()._build(lr_schedule)
         self.averaged_actor: Actor | None = None
         if self.average_actor:
@@ -118,11 +120,11 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
             self.averaged_actor.reset_noise(batch_size)
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
-        return super().make_actor(features_extractor or self._extractor(self.actor_kwargs, "observation"))
+        return super().make_actor(features_extractor or self._extractor("observation"))
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
         key = UNDELAYED if self.delay_reconciled_critic else "observation"
-        critic = super().make_critic(features_extractor or self._extractor(self.critic_kwargs, key))
+        critic = super().make_critic(features_extractor or self._extractor(key))
         if self.critic_layer_norm:
             for network in critic.q_networks:
                 assert isinstance(network, nn.Sequential)  # as SB3 makes them
@@ -131,12 +133,12 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
                     network.insert([*network].index(hidden) + 1, norm)
         return critic
 
-    def _extractor(self, network_kwargs: dict[str, Any], key: str) -> BaseFeaturesExtractor | None:
+    def _extractor(self, key: str) -> BaseFeaturesExtractor | None:
+        """Return what reads a key of delayed observations, or all of others; None for SB3's own."""
         if self.replay_space is None:
             if self.state_normalizer is None:
                 return None
             return NormalizedExtractor(self.make_features_extractor(), self.state_normalizer)
-        network_kwargs["observation_space"] = self.replay_space
         if self.augment_state and key != UNDELAYED:
             return StateAugmentedExtractor(self.replay_space, self.state_normalizer)
         return KeyExtractor(self.replay_space, key, self.state_normalizer)
@@ -165,18 +167,19 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         space = self.observation_space
         is_delayed = isinstance(space, spaces.Dict)
         boxes = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
-        if isinstance(observation, dict) and not is_delayed:
+        is_dict = isinstance(observation, dict)
+        if is_dict and not is_delayed:
             raise ValueError(
                 f"The agent was built for a task without delay, got a dict with the keys {list(observation)}; "
                 "leave DelayedObservationWrapper out."
             )
-        parts = observation if isinstance(observation, dict) else {"observation": observation}
-        if is_delayed and (parts is not observation or set(parts) != set(boxes)):
-            given = f"the keys {list(parts)}" if parts is observation else type(observation).__name__
+        if is_delayed and not (is_dict and set(observation) == set(boxes)):
+            given = f"the keys {list(observation)}" if is_dict else type(observation).__name__
             raise ValueError(
                 f"The agent was built for dict observations with the keys {sorted(boxes)}, got {given}; "
                 "wrap the task in DelayedObservationWrapper."
             )
+        parts = observation if isinstance(observation, dict) else {"observation": observation}
         arrays = {key: _as_float32(key, parts[key], box) for key, box in boxes.items()}
         batches = {key: None if x.shape == boxes[key].shape else len(x) for key, x in arrays.items()}
         if len(set(batches.values())) > 1:

@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
-from stable_baselines3.common.utils import get_parameters_by_name, polyak_update
+from stable_baselines3.common.utils import polyak_update
 
 from sb3_said.delays.space import UNDELAYED
 from sb3_said.sac.delayed_sac import DelayedSAC
@@ -89,8 +88,6 @@ class StableSAC(DelayedSAC):
         self.policy_kwargs = given
         if self.use_sde and self.policy.averaged_actor is not None:
             self.policy.averaged_actor.reset_noise()  # which does not move to a GPU with the networks
-        actors = self.actor, self.policy.averaged_actor or self.actor
-        self._running_stats = tuple(get_parameters_by_name(actor, ["running_"]) for actor in actors)  # of a batch norm
 
     def _policy_flags(self) -> dict[str, Any]:
         return {
@@ -100,17 +97,6 @@ class StableSAC(DelayedSAC):
             "average_actor": self.actor_averaging > 0.0,
             "critic_layer_norm": self.critic_layer_norm,
         }
-
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        before = self._last_obs
-        learn = super()._setup_learn(*args, **kwargs)
-        if self._last_obs is not before:  # the environments were reset
-            self._running_returns = np.zeros(self.n_envs)
-        return learn
-
-    def _begin_episodes(self) -> None:
-        super()._begin_episodes()
-        self._running_returns = np.zeros(self.n_envs)
 
     def _sample_action(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, np.ndarray]:
         with self.policy.without_average():
@@ -127,9 +113,9 @@ class StableSAC(DelayedSAC):
     ) -> None:
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)  # refuses what is NaN
         if self.policy.return_scale is not None:
-            self._running_returns = self.gamma * self._running_returns + reward
+            begins = replay_buffer.steps[replay_buffer.pos - 1] == 0  # (n_envs,), as the replay saw it
+            self._running_returns = reward + self.gamma * np.where(begins, 0.0, self._running_returns)
             self.policy.return_scale.update(self._running_returns)
-            self._running_returns = self._running_returns * (1 - dones)
 
     def _look_at_states(self) -> None:
         """Fit the z-scores to the states in replay, once there are a tenth more of them than last time.
@@ -154,8 +140,8 @@ class StableSAC(DelayedSAC):
             n = self._n_updates // self.policy_delay
             decay = min(self.actor_averaging, 1.0 - 1.0 / n)
             polyak_update(self.actor.parameters(), self.policy.averaged_actor.parameters(), 1.0 - decay)
-            own, averaged = self._running_stats
-            polyak_update(own, averaged, 1.0)
+            for own, averaged in zip(self.actor.buffers(), self.policy.averaged_actor.buffers(), strict=True):
+                averaged.copy_(own)  # of a batch norm
             if self.use_sde:
                 self.policy.averaged_actor.reset_noise()  # of the spread that it has learned by now
 

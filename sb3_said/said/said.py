@@ -233,10 +233,9 @@ class SAID(OfflineAlgorithm, StableSAC):
             )
         self.policy.set_answer(who, expert_up_to, expert_from)
 
-    def check_ages(self, ages: list[int]) -> None:
-        """Refuse ages that the planner cannot plan at, where it answers; warn as ``DelayedSAC`` where the expert does.
+    def _acts_at(self, ages: list[int]) -> list[int]:
+        """Return the ages that the expert's actor meets; of the others, refuse those that the planner cannot plan at.
 
-        :param ages: that it will meet amid episodes, in control steps
         :raises ValueError: as :meth:`InpaintingPlanner.check_ages`
         """
         who = self.policy.who_answers
@@ -245,7 +244,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         acts_at = [age for age in ages if who == "expert" or (who == "both" and age in self.policy.expert_ages)]
         if who in ("planner", "both") and self.policy.planner.config.decided_by == "actor":
             acts_at.append(0)  # on the present, as if it saw it
-        super().check_ages(acts_at)
+        return acts_at
 
     def distill(self, width: int = 256, progress_bar: bool = False, **settings: Any) -> float:
         """Train a student: a plain network that answers as the planner does at temperature 0, much faster.
@@ -325,6 +324,7 @@ class SAID(OfflineAlgorithm, StableSAC):
     @th.no_grad()
     def _stored_values(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """Return values as the environment's rewards would sum up, of states as windows have them: (B,)."""
+        self.critic.set_training_mode(False)  # until the next update; batch norm must not learn from this
         values = self.policy.q_value(states.to(self.device), actions.to(self.device)).cpu()
         env = self._vec_normalize_env
         return values if env is None else th.from_numpy(env.unnormalize_reward(values.numpy()))
@@ -448,7 +448,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         """
         total = self.planner_gradient_steps if gradient_steps is None else _count("gradient_steps", gradient_steps)
         with self._as_before_if_it_fails():
-            self.planner_ways = ways_of(self.planner_ways, self.planner_kwargs, "iql")
+            ways_of(self.planner_ways, self.planner_kwargs, "iql")  # refuses what V(s) cannot score
             watcher = self._begin_offline(dataset, total, callback, tb_log_name, True, progress_bar)
             self.value = "iql"
             self.policy.set_value("iql")
@@ -481,7 +481,7 @@ class SAID(OfflineAlgorithm, StableSAC):
     @contextmanager
     def _as_before_if_it_fails(self) -> Iterator[None]:
         """Take back what a training from logs changes before its first update, if it gets no further."""
-        names = "planner_ways", "replay_buffer", "num_timesteps", "value"
+        names = "replay_buffer", "num_timesteps", "value"
         before, policy = {name: getattr(self, name) for name in names}, self.policy
         values, config = policy.values, policy.planner.config
         try:

@@ -15,6 +15,7 @@ from tqdm.auto import tqdm
 
 from sb3_said.delays.space import KEYS, check_spaces
 from sb3_said.planner.plain import ZScored, plain_network
+from sb3_said.replay.windows import WindowSource
 from sb3_said.sac.extractors import StateAugmentedExtractor
 from sb3_said.sac.policies import as_array
 
@@ -115,8 +116,9 @@ class _Rows:
     labels: th.Tensor  # (M, act_dim)
     presents: th.Tensor  # (M, obs_dim), s_t; NaN where it is not known
 
-    def __add__(self, other: _Rows) -> _Rows:
-        return _Rows(*(th.cat(pair) for pair in zip(vars(self).values(), vars(other).values(), strict=True)))
+    @staticmethod
+    def join(parts: list[_Rows]) -> _Rows:
+        return _Rows(*map(th.cat, zip(*(vars(part).values() for part in parts), strict=True)))
 
     def __getitem__(self, rows: th.Tensor | slice) -> _Rows:
         return _Rows(*(part[rows] for part in vars(self).values()))
@@ -132,10 +134,10 @@ def distill(model: SAID, config: Distillation, progress_bar: bool = False) -> fl
     model.policy.set_training_mode(False)
     student, generator = model.policy.student, th.Generator().manual_seed(model.seed or 0)
     if model.replay_buffer is not None and model.replay_buffer.size() > 0:
+        source = model.replay_buffer.window_source(model.newest_fraction, model.get_vec_normalize_env())
         n_parts = -(-config.n_labels // LABELLED_AT_ONCE)
         bar = tqdm(range(n_parts), desc="the planner's answers", disable=not progress_bar)
-        parts = [_replayed(model, config, generator) for _ in bar]
-        rows = sum(parts[1:], parts[0])[: config.n_labels]
+        rows = _Rows.join([_replayed(model, source, generator) for _ in bar])[: config.n_labels]
     else:
         rows = _visited(model, "planner", config.n_labels, generator)
     n_held_out = int(HELD_OUT * len(rows.inputs))
@@ -146,7 +148,7 @@ def distill(model: SAID, config: Distillation, progress_bar: bool = False) -> fl
     rounds = config.rounds if model.env is not None and config.own_steps > 0 else 0
     for k in tqdm(range(config.gradient_steps), desc="student", disable=not progress_bar):
         if k > 0 and rounds and k % -(-config.gradient_steps // (rounds + 1)) == 0:
-            rows = rows + _visited(model, "student", -(-config.own_steps // rounds), generator)
+            rows = _Rows.join([rows, _visited(model, "student", -(-config.own_steps // rounds), generator)])
         drawn = th.randint(len(rows.inputs), (config.batch_size,), generator=generator).to(rows.inputs.device)
         loss = _loss(model, rows[drawn], config.q_weight)
         optimizer.zero_grad()
@@ -180,10 +182,9 @@ def _labelled(model: SAID, parts: dict[str, th.Tensor], presents: th.Tensor) -> 
     return _Rows(inputs, th.cat(labels), presents)
 
 
-def _replayed(model: SAID, config: Distillation, generator: th.Generator) -> _Rows:
+def _replayed(model: SAID, source: WindowSource, generator: th.Generator) -> _Rows:
     """Label observations of the replay, seen at ages that the planner plans at."""
     planner, n, max_delay = model.policy.planner, LABELLED_AT_ONCE, model.policy.max_delay
-    source = model.replay_buffer.window_source(model.newest_fraction, model.get_vec_normalize_env())
     windows = source.sample(n, max_delay + 1, generator, planner.config.early_probability)
     ages = th.full((n,), max_delay)
     if planner.config.mask != "fixed":

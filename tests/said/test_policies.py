@@ -469,6 +469,17 @@ def test_the_actor_decides_on_the_guessed_present_as_if_it_saw_it(saved, tmp_pat
     assert not np.allclose(answer(model, obs), plans[:, 0])
 
 
+def test_a_warning_of_ages_that_were_not_met_points_at_the_call(saved):
+    model, obs = SAID.load(saved, device="cpu"), observe()
+    model.set_answer("expert")
+    model.trained_ages = [0]
+    with pytest.warns(UserWarning, match="learned at ages 0 and is given") as caught:
+        model.predict(obs)
+    with pytest.warns(UserWarning, match="learned at ages 0 and is given") as of_env:
+        model.set_env(make().get_env())
+    assert {warning.filename for warning in (*caught, *of_env)} == {__file__}
+
+
 def test_no_actor_that_has_not_learned_decides():
     with pytest.raises(ValueError, match="decided_by='actor' lets the expert's actor decide, which this agent has not"):
         make().set_planner(decided_by="actor")

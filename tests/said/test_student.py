@@ -17,7 +17,7 @@ from sb3_said import SAID
 from sb3_said.delays.space import delayed_space
 from sb3_said.sac.extractors import StateAugmentedExtractor
 from sb3_said.said import student as student_module
-from sb3_said.said.student import Distillation, Student
+from sb3_said.said.student import Student
 
 QUICK = {"width": 32, "n_labels": 700, "own_steps": 60, "rounds": 2, "gradient_steps": 400, "batch_size": 64}
 
@@ -39,6 +39,11 @@ def with_answers(model):
     for parameter in model.policy.planner.parameters():
         th.nn.init.normal_(parameter, std=0.15, generator=generator)
     return model
+
+
+def replayed(model, generator):
+    source = model.replay_buffer.window_source(model.newest_fraction, model.get_vec_normalize_env())
+    return student_module._replayed(model, source, generator)
 
 
 @pytest.fixture
@@ -110,7 +115,7 @@ def test_its_error_is_over_rows_that_it_did_not_learn_from_and_its_rate_falls_to
     try:
         error = pupil.distill(**{**QUICK, "own_steps": 0, "gradient_steps": 100}, learning_rate=0.01)
         generator = th.Generator().manual_seed(pupil.seed)
-        parts = [student_module._replayed(pupil, Distillation(), generator) for _ in range(2)]
+        parts = [replayed(pupil, generator) for _ in range(2)]
     finally:
         pupil.planner_newest_fraction = 1.0
     inputs, labels = (th.cat([getattr(part, name) for part in parts])[:700] for name in ("inputs", "labels"))
@@ -135,7 +140,7 @@ def test_the_labels_are_the_planners_at_temperature_0_at_every_age(taught, monke
         return made
 
     monkeypatch.setattr(model.policy.planner, "plan", recorded)
-    rows = student_module._replayed(model, Distillation(), th.Generator().manual_seed(0))
+    rows = replayed(model, th.Generator().manual_seed(0))
     ((states, history, delay), kwargs, action) = seen[0]
     assert kwargs == {"temperature": 0.0} and sorted(set(delay.tolist())) == [0, 1, 2]
     assert th.equal(rows.labels, action)
@@ -220,7 +225,7 @@ def test_it_learns_where_it_goes_itself(pupil, monkeypatch):
 def test_the_critics_can_have_a_say(pupil):
     def taught_by(q_weight):
         pupil.distill(**{**QUICK, "own_steps": 0, "q_weight": q_weight})
-        rows = student_module._replayed(pupil, Distillation(), th.Generator().manual_seed(1))
+        rows = replayed(pupil, th.Generator().manual_seed(1))
         with th.no_grad():
             answers = pupil.policy.student.answer(rows.inputs)
             return pupil.policy.q_value(rows.presents, answers).mean(), (answers - rows.labels).square().mean()
@@ -230,7 +235,7 @@ def test_the_critics_can_have_a_say(pupil):
 
 
 def test_their_say_is_in_mean_sizes_of_q(taught):
-    rows = student_module._replayed(taught, Distillation(), th.Generator().manual_seed(1))
+    rows = replayed(taught, th.Generator().manual_seed(1))
     unknown = student_module._Rows(rows.inputs[:9], rows.labels[:9], th.full_like(rows.presents[:9], th.nan))
     answers = taught.policy.student.answer(rows.inputs)
     q = taught.policy.q_value(rows.presents, answers)
