@@ -181,7 +181,7 @@ def take_statistics(vec_normalize: VecNormalize, data: Dataset) -> None:
     """Let a ``VecNormalize`` learn from logged episodes what it would have in play, one after the other."""
     if vec_normalize.norm_obs:
         rms = vec_normalize.obs_rms
-        (rms["observation"] if isinstance(rms, dict) else rms).update(data.states)
+        (rms["observation"] if isinstance(rms, dict) else rms).update(data.states.astype(np.float64))
     if vec_normalize.norm_reward:
         returns, value = np.zeros(len(data)), 0.0
         for i, (reward, ends) in enumerate(zip(data.rewards, data.ends, strict=True)):

@@ -284,7 +284,7 @@ class InpaintingPlanner(nn.Module):
             plan = plan._replace(states=plan.states[:, :, :reached], actions=plan.actions[:, :, :reached])
         else:
             plan = self._inpaint(steps, value_fn, shortest, longest > shortest, *inputs)
-        if plan.values.isnan().any() | ~plan.action.isfinite().all():
+        if ~plan.values.amax(1).isfinite().all() | ~plan.action.isfinite().all():  # of a NaN, too
             found = "The planner's candidates are not finite; check its weights"
             if plan.actions.isfinite().all() and plan.states.isfinite().all():
                 found = "value_fn returned NaN or infinity, or -inf for all, so that no candidate is the best; check it"

@@ -111,8 +111,9 @@ class StableSAC(DelayedSAC):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
+        is_stored = self._last_obs is not None  # else a callback has played at this very step
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)  # refuses what is NaN
-        if self.policy.return_scale is not None:
+        if is_stored and self.policy.return_scale is not None:
             begins = replay_buffer.steps[replay_buffer.pos - 1] == 0  # (n_envs,), as the replay saw it
             self._running_returns = reward + self.gamma * np.where(begins, 0.0, self._running_returns)
             self.policy.return_scale.update(self._running_returns)

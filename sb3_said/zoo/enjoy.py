@@ -191,7 +191,7 @@ def main(argv: list[str] | None = None) -> None:
         if args.size is not None:
             drawn |= {"width": args.size, "height": args.size}
         played = args.algo, args.env, read_delay(args.delay), args.device, drawn, args.gym_packages
-        run = load_run(args.run, *played)
+        run = load_run(args.run, *played, answer=args.answer)
         if args.beside_ignorant and not longest_delay(run.model):
             raise ValueError(f"--beside-ignorant needs an agent that is told an age; {args.run} knows no delay.")
         with answering(run.model, args.answer), closing(video) if video else nullcontext():

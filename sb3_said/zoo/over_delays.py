@@ -79,7 +79,10 @@ def main(argv: list[str] | None = None) -> None:
         if args.plot is not None:
             plots.check_file(args.plot)  # what cannot be drawn is told now, and not after the episodes
             check_writable(args.plot)
-        delays = list(dict.fromkeys(read_name(word) for word in args.delays or ()))
+        named: dict[str, int | str] = {}  # by process, which may be written in two ways: a second column of it would
+        for name in map(read_name, args.delays or ()):  # count as another training seed
+            named.setdefault(repr(make_process(name)), name)
+        delays = list(named.values())
         playing = "algo", "env", "episodes", "seed", "device", "gym_packages", "n_envs", "workers"
         unused = [name.replace("_", "-") for name in playing if getattr(args, name) != parser.get_default(name)]
         if unused and not args.runs:

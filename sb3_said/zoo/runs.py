@@ -19,11 +19,12 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.env_util import unwrap_wrapper
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_said import SAID, DelayedSAC, __version__
-from sb3_said.delays import DelayProcess, FixedDelay
+from sb3_said.delays import DelayedObservationWrapper, DelayProcess, FixedDelay
 from sb3_said.delays.space import ages_of, has_state_history
 from sb3_said.evaluation.rollout import Observation, Rollout, rollout
 from sb3_said.files.agents import task_of
@@ -234,8 +235,9 @@ def origin(run: LoadedRun) -> dict[str, Any]:
 
 
 def _process_of(env: gym.Env[Any, Any]) -> DelayProcess | None:
-    """Return the delays of a task that has some."""
-    return env.get_wrapper_attr("process") if env.has_wrapper_attr("process") else None
+    """Return the delays of a task that has some; an attribute of its own named ``process`` may be anything."""
+    wrapper = unwrap_wrapper(env, DelayedObservationWrapper)
+    return wrapper.process if isinstance(wrapper, DelayedObservationWrapper) else None
 
 
 def _with_delay(wrappers: list[Any], delay: Delay, model: BaseAlgorithm) -> list[Any]:

@@ -47,9 +47,11 @@ def budget(word: str) -> int:
     return int(word)
 
 
-#: Options of rl_zoo3 that are read here first: an agent's path from anywhere, and what rl_zoo3 would take for another.
+#: Options of rl_zoo3 that are read here first: paths, which a resume finds from anywhere, and what rl_zoo3 would take
+#: for another.
 PASSED_ON: dict[tuple[str, ...], Callable[[str], Any]] = {
     ("-i", "--trained-agent"): os.path.abspath,
+    ("-tb", "--tensorboard-log"): lambda word: word and os.path.abspath(word),  # "" is none; a resume finds the others
     ("-n", "--n-timesteps"): budget,
     ("--device",): device,
 }

@@ -11,8 +11,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from test_bc import demonstrations
 from torch.nn import functional as F
 
-from sb3_said.offline import DQL, DQLConfig
+from sb3_said.offline import DQL, Dataset, DQLConfig
 from sb3_said.offline.dql import schedule
+from sb3_said.offline.learning import take_statistics
 
 SMALL = {"hidden": 32, "n_candidates": 4}
 
@@ -50,6 +51,13 @@ def test_vec_normalize_scales_the_rewards_of_logs_as_it_would_in_play():
     env.training = False  # a deployed one stays as it is
     model.take_dataset(demonstrations(5))
     assert env.ret_rms.var == pytest.approx(played.ret_rms.var, rel=1e-3)
+
+
+def test_vec_normalize_learns_the_states_of_long_logs_exactly():
+    env = VecNormalize(DummyVecEnv([Drift]), norm_reward=False)
+    states = np.full((200_000, 2), 0.1, np.float32)  # which float32 would sum up to a hundredth more
+    take_statistics(env, Dataset(states, states[:, :1], states[:, 0], *np.zeros((2, len(states)), bool), states[-1:]))
+    np.testing.assert_allclose(env.obs_rms.mean, 0.1, rtol=1e-5)
 
 
 @pytest.mark.parametrize("n_steps", [1, 5, 20])

@@ -319,6 +319,8 @@ def test_a_value_of_minus_infinity_forbids_a_candidate(factor):
         middle = actions[..., 0].median(1, keepdim=True).values
         return th.where(actions[..., 0] < middle, states.sum(-1) + actions[..., 1], -th.inf)
 
+    with pytest.raises(ValueError, match="-inf for all, so that no candidate is the best"):
+        planner.plan(*batch, value_fn=lambda states, _: th.full_like(states[..., 0], -th.inf))
     plan, rows = planner.plan(*batch, value_fn=allowed_value, generator=seeded()), th.arange(4)
     assert plan.values.isinf().any() and plan.values.isfinite().any(1).all()
     for row in rows:

@@ -14,6 +14,7 @@ from hypothesis.extra.numpy import arrays
 from small_agent import make as make_agent
 from small_agent import observe
 from small_task import Drift, delayed
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.torch_layers import FlattenExtractor
@@ -187,6 +188,20 @@ def test_a_new_training_s_returns_begin_with_its_episodes():
     model.learn(2)  # the episode before was cut off
     assert model.policy.return_scale.largest == 1 + 0.5 + 0.25
     assert model._running_returns == 1 + 0.5
+
+
+def test_a_step_that_a_callback_has_played_over_does_not_count_in_the_scale_of_rewards():
+    class Play(BaseCallback):
+        def _on_step(self):
+            if self.n_calls == 6:  # an episode's first step, behind one that has ended
+                with self.model.borrowed_env() as env:
+                    env.reset()
+            return True
+
+    model = make(Drift(length=5), gamma=0.5, learning_starts=100).learn(20, callback=Play())
+    scale = model.policy.return_scale
+    assert round(float(scale.count)) == model.replay_buffer.size() == 19  # its observation is gone
+    assert scale.largest == pytest.approx(sum(0.5**k for k in range(5)))
 
 
 def test_all_rates_follow_the_schedule():

@@ -317,6 +317,23 @@ def test_enjoy_prints_every_episode(run: Path, tmp_path: Path, capsys: pytest.Ca
     assert "seed 10000: return" in out and "seed 10001: return" in out and film.stat().st_size > 0
 
 
+def test_the_expert_of_a_planner_of_one_delay_is_watched_at_others(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model: Any = load_run(run, device="cpu").model
+    model.policy.make_planner(replace(model.policy.planner.config, mask="fixed", present="inpainted"))
+    model.policy.planner_updates.fill_(1.0)
+    model.save(tmp_path / "fixed.zip")
+    shown: list[Any] = []
+    monkeypatch.setattr(enjoy, "check_can_record", lambda path: None)
+    monkeypatch.setattr(enjoy, "show", lambda run, *_: shown.append((run.model.policy.who_answers, run.info["delay"])))
+    words = [str(tmp_path / "fixed.zip"), "--env", ENV, "--delay", "1", "--record", str(tmp_path / "film.gif")]
+    enjoy.main([*words, "--answer", "expert"])
+    assert shown == [("expert", 1)]
+    with pytest.raises(SystemExit):
+        enjoy.main([*words, "--answer", "planner"])
+
+
 def test_an_agent_beside_itself_that_ignores_the_delay(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -257,6 +257,18 @@ def test_workers_change_the_speed_only(said: Path, tmp_path: Path) -> None:
     assert [cell["result"] is None for cell in two["cells"]] == [False, True] * 2
 
 
+def test_a_delay_written_in_two_ways_is_played_once(
+    sadr: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A second column of it would count as another training seed."""
+    words = ["UniformDelay(0, 1)", "1", "UniformDelay(0,1)", "FixedDelay(1)", "UniformDelay(low=0, high=1)"]
+    file = tmp_path / "out.json"
+    assert [cell["delay"] for cell in play(file, [sadr], words)["cells"]] == ["UniformDelay(0, 1)", 1]
+    capsys.readouterr()
+    over_delays.main(["--json", str(file), "--delays", "UniformDelay(0,1)", "1"])
+    assert "training seeds" not in capsys.readouterr().out
+
+
 def test_only_the_warning_of_another_delay_is_silent(sadr: Path) -> None:
     with pytest.warns(UserWarning, match="learned at ages"):
         load_run(sadr, delay=0, device="cpu")

@@ -14,6 +14,7 @@ import pytest
 pytest.importorskip("rl_zoo3")
 
 from rl_zoo3.wrappers import TimeFeatureWrapper
+from small_task import Drift
 from trained_run import PLANNER, train_here
 
 from sb3_said import DelayedObservationWrapper, DelayedSAC
@@ -96,6 +97,22 @@ def test_a_task_registered_with_its_delay_keeps_it(tmp_path: Path) -> None:
             assert opened.info["delay"] == 1 and opened.play(1, seed=0).lengths.tolist() == [200]
     finally:
         del gym.registry["Late-v0"]
+
+
+class Simulated(Drift):
+    process = "of a simulator"
+
+
+@pytest.mark.parametrize("delay", [3, None])
+def test_a_process_of_the_task_s_own_is_no_delay(delay: int | None, tmp_path: Path) -> None:
+    gym.register("Simulated-v0", Simulated, max_episode_steps=5)
+    try:
+        env = gym.make("Simulated-v0")
+        DelayedSAC("MlpPolicy", env if delay is None else DelayedObservationWrapper(env, delay)).save(tmp_path / "a")
+        opened = load_run(tmp_path / "a.zip", "sadr", "Simulated-v0", device="cpu")
+        assert opened.info["delay"] == (delay or 0) and opened.play(1, seed=0).lengths.tolist() == [5]
+    finally:
+        del gym.registry["Simulated-v0"]
 
 
 def test_an_action_delay_of_the_task_counts_among_what_it_can_play(

@@ -465,6 +465,15 @@ def test_a_given_agent_is_found_from_another_folder_too(monkeypatch: pytest.Monk
     assert not any("trained-agent" in word for word in train.read_command_line([])[2])
 
 
+def test_a_resume_from_another_folder_goes_on_with_the_same_curve(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert f"--tensorboard-log={tmp_path / 'tb'}" in train.read_command_line(["-tb", "tb"])[2]
+    assert "--tensorboard-log=" in train.read_command_line(["-tb", ""])[2]  # rl_zoo3's for none
+    assert not any("tensorboard" in word for word in train.read_command_line([])[2])
+
+
 @pytest.mark.parametrize(
     ("given", "read"),
     [

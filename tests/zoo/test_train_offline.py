@@ -286,6 +286,7 @@ def test_the_paper_preset_has_the_papers_pairs_by_the_datasets_name() -> None:
             planner = made["planner_kwargs"]
             assert (planner["depth"], planner["temperature"]) == pair, (env_id, kind, delay)
             assert (made["n_timesteps"], planner["mask"]) == (1_000_000, "fixed")
+            assert made["iql_kwargs"] == {"updates": 1}  # Algorithm 2
             assert "planner_by_dataset" not in made
     varies = preset_overrides(config_file("said", True), "paper", "Hopper-v5", [0, 16], None, ["medium"])
     assert varies["planner_kwargs"]["mask"] == "random"
