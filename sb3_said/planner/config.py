@@ -20,7 +20,7 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "prediction": PREDICTIONS,
     "schedule": SCHEDULES,
     "time_sampling": TIME_SAMPLINGS,
-    "mask": ("random", "fixed", "none"),
+    "mask": ("random", "own", "fixed", "none"),
     "action_transform": ("standard", "tanh"),
     "scored_states": ("future", "decision", "all"),
     "present": ("inpainted", "guessed"),
@@ -64,6 +64,7 @@ class PlannerConfig:
     # planners of one replay did (measured, results/what_diffusion_buys.md). 0 is the paper's; in [0, 1]
     early_probability: float = 0.25
     # Which actions a training window shows: those of a delay drawn from 0..max_delay, so that one network serves all;
+    # "own": the same, in windows whose decision was made on an observation of that age, where the data know it;
     # "fixed": those of max_delay (paper); "none": no action, so that every window begins at the present and has horizon
     # steps, and the first guess goes there from an old observation
     mask: str = "random"
@@ -91,7 +92,7 @@ class PlannerConfig:
     # "inpainted" (paper): the present and the plan are one sample; "guessed": the present is the first guess's, and the
     # planner plans from there as if it had seen it: at least level on logs and on an expert's replay, and worth twice
     # as much on some (measured, results/nine_logs.md), as a decision from an old observation is nearer to the mean of
-    # what may be right. None: "guessed" where there is a guess and ``mask`` knows age 0
+    # what may be right. None: "guessed" where there is a guess and ``mask`` is "random" or "none"
     present: str | None = None
     # "plan" (paper): the action that the plan has at the present; "actor": what SAID's expert does where it sees the
     # guessed present, without delay; then no plan is made
@@ -146,7 +147,8 @@ class PlannerConfig:
         """:raises ValueError: for a guessed present where nothing guesses, and any other where none is inpainted"""
         can_guess = self.first_guess != "none" and self.mask != "fixed"
         if self.present is None:
-            object.__setattr__(self, "present", "guessed" if can_guess else "inpainted")
+            is_guessed = can_guess and self.mask != "own"  # who plans as if it saw the guess does what is done at age 0
+            object.__setattr__(self, "present", "guessed" if is_guessed else "inpainted")
         if self.present == "guessed" and not can_guess:
             raise ValueError(
                 f"present is 'guessed' with first_guess={self.first_guess!r} and mask={self.mask!r}; expected a "

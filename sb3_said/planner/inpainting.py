@@ -75,12 +75,12 @@ def draw_delays(
     """Draw the mask lengths of a training batch on the generator's device: (B,) int64 in 0..D.
 
     :param mask: ``"random"``: one network for every delay up to D; ``"fixed"``: always D (the paper's); ``"none"``:
-        always 0
+        always 0; ``"own"``: as ``"random"``
     :param end_probability: with this probability a random length is 0 or D, half each, instead of uniform over 0..D:
         0 starts every episode and D is the longest and hardest
     """
     device = "cpu" if generator is None else generator.device
-    if mask != "random":
+    if mask in ("fixed", "none"):
         return th.full((batch_size,), max_delay if mask == "fixed" else 0, device=device)
     uniform = th.randint(max_delay + 1, (batch_size,), generator=generator, device=device)
     ends = max_delay * th.randint(2, (batch_size,), generator=generator, device=device)

@@ -125,6 +125,7 @@ class PlannerTrainer:
         values = scaled_values(training_source.values, self.config.value_scale)
         self.source = replace(training_source, values=values).to(self.device)
         self.older = older
+        self._is_own = self.config.mask == "own" and source.ages is not None
         sizes = planner.obs_dim, planner.act_dim, planner.max_delay
         with th.random.fork_rng(devices=[]):  # initial weights are the only draws that take no generator
             th.default_generator.manual_seed(seed)  # th.manual_seed would seed GPUs, too
@@ -212,9 +213,11 @@ class PlannerTrainer:
         config = self.config
         for optimizer in self._optimizers.values():
             optimizer.zero_grad()
-        drawn = config.batch_size, self.average.window_length, self.generator, config.early_probability
-        windows = self.source.sample(*drawn)
-        delay = self._draw_delays(config.mask)  # (B,)
+        drawn = self.average.window_length, self.generator, config.early_probability
+        if self._is_own:
+            windows, delay = self.source.sample_own(self._draw_delays(config.mask), *drawn)
+        else:
+            windows, delay = self.source.sample(config.batch_size, *drawn), self._draw_delays(config.mask)  # (B,)
         weight = window_weight(windows.values, config.weight_factor)  # (B,)
         loss = self.online.loss(windows, delay, weight, self.generator)
         loss.backward()
@@ -355,6 +358,8 @@ class PlannerTrainer:
         held_out = {}
         for d in [D] if self.config.mask == "fixed" else range(D + 1):
             long_enough = th.nonzero(source.remaining > d)[:, 0]  # index d, the decision, is in the same episode
+            if self._is_own and len(own := source.own_starts(d)):
+                long_enough = own
             starts = long_enough[th.randperm(len(long_enough), generator=generator)[:HELD_OUT_WINDOWS]]
             if len(starts):
                 held_out[d] = source.gather(starts, self.average.window_length).to(self.device)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch as th
+
+MET = 0.25  # of an even share of the decisions: an age that fewer were made at is too rare to imitate by itself
 
 
 class Windows(NamedTuple):
@@ -41,6 +43,8 @@ class WindowSource:
     :param remaining: (n_starts,) int64, stored steps from the start to its episode's end, both included, >= 1
     :param episodes: (n_starts,) int64, a number for the episode each start belongs to
     :param values: (n_starts,) float32, a value of each start's state, by which a trainer may weigh windows
+    :param ages: (n_starts,) int64, of the observation that each start's action was decided on, in control steps; None
+        where that is not known, as in logs
     """
 
     states: th.Tensor
@@ -52,6 +56,7 @@ class WindowSource:
     remaining: th.Tensor
     episodes: th.Tensor
     values: th.Tensor
+    ages: th.Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -75,16 +80,54 @@ class WindowSource:
         :param early_probability: of a start whose episode is uniform over all episodes, and the logarithm of whose step
             is uniform: as many in steps 1 to 10 of an episode as in 10 to 100
         """
+        return self.gather(self._draw(batch_size, generator, early_probability)[0], length)
+
+    def sample_own(
+        self, delay: th.Tensor, length: int, generator: th.Generator | None = None, early_probability: float = 0.0
+    ) -> tuple[Windows, th.Tensor]:
+        """Draw windows whose decision, d steps after their start, was made on the observation at their start.
+
+        An agent of varying delays may do one thing on new observations and another on old ones. Where a window shows
+        what its decision was made on, there is one answer to learn; else their mean.
+
+        :param delay: (B,) int64 d, ages to draw decisions of. Of an age that hardly any was made at any window is drawn
+        :param length: L, steps of a window
+        :param generator: torch's global one of the CPU by default
+        :param early_probability: as of :meth:`sample`, of decisions, whose age is then their own
+        :return: windows, and the ages of their decisions, (B,)
+        """
+        seen, by_age, firsts, sizes, is_met = self._seen
+        drawn, is_early = self._draw(len(delay), generator, early_probability)
+        place = th.rand(len(delay), generator=generator, device="cpu" if generator is None else generator.device)
+        age = delay.clamp(max=len(sizes) - 1)
+        step = (place.to(delay.device) * sizes[age]).long().clamp(max=sizes[age] - 1)
+        starts = th.where(is_met[age] & (delay == age), by_age[firsts[age] + step], drawn)
+        is_early = is_early & (seen[drawn] >= 0)
+        assert self.ages is not None  # for mypy: _seen has read them
+        starts, delay = th.where(is_early, seen[drawn], starts), th.where(is_early, self.ages[drawn], delay)
+        return self.gather(starts, length), delay
+
+    def own_starts(self, age: int) -> th.Tensor:
+        """Return the starts that decisions of an age were made on, and none where :meth:`sample_own` draws others."""
+        _, by_age, firsts, sizes, is_met = self._seen
+        n = int(sizes[age]) if age < len(sizes) and is_met[age] else 0
+        return by_age[int(firsts[age]) :][:n] if n else by_age[:0]
+
+    def _draw(
+        self, batch_size: int, generator: th.Generator | None, early_probability: float
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """Return starts, and which of them are drawn early: (B,) int64 and bool."""
         device = "cpu" if generator is None else generator.device
         starts = th.randint(len(self), (batch_size,), generator=generator, device=device).to(self.rows.device)
-        if early_probability > 0:
-            order, firsts, sizes = self._by_episode
-            draw = partial(th.rand, batch_size, generator=generator, device=device)
-            is_early, place, step = (draw().to(starts.device) for _ in range(3))
-            episode = (place * len(sizes)).long().clamp(max=len(sizes) - 1)  # (B,)
-            step = ((sizes[episode] + 1) ** step - 1).long().clamp(max=sizes[episode] - 1)
-            starts = th.where(is_early < early_probability, order[firsts[episode] + step], starts)
-        return self.gather(starts, length)
+        if early_probability == 0:
+            return starts, th.zeros_like(starts, dtype=th.bool)
+        order, firsts, sizes = self._by_episode
+        draw = partial(th.rand, batch_size, generator=generator, device=device)
+        chance, place, step = (draw().to(starts.device) for _ in range(3))
+        is_early = chance < early_probability
+        episode = (place * len(sizes)).long().clamp(max=len(sizes) - 1)  # (B,)
+        step = ((sizes[episode] + 1) ** step - 1).long().clamp(max=sizes[episode] - 1)
+        return th.where(is_early, order[firsts[episode] + step], starts), is_early
 
     @cached_property
     def _by_episode(self) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
@@ -93,6 +136,25 @@ class WindowSource:
         order = by_step[self.episodes[by_step].argsort(stable=True)]
         sizes = th.unique(self.episodes, return_counts=True)[1]
         return order, sizes.cumsum(0) - sizes, sizes
+
+    @cached_property
+    def _seen(self) -> tuple[th.Tensor, th.Tensor, th.Tensor, th.Tensor, th.Tensor]:
+        """What each decision was made on: the start that lies its age before it, -1 where that is not here.
+
+        :return: these starts, (n_starts,); those that are here, by age; and of each age the first place there, their
+            number, and whether it is drawn
+        """
+        assert self.ages is not None  # for mypy: the callers have seen to it
+        order, firsts, sizes = self._by_episode
+        place = th.arange(len(order), device=order.device)
+        before, ages = place - self.ages[order], self.ages[order]
+        is_here = before >= firsts.repeat_interleave(sizes)  # in the same episode
+        seen = th.full_like(order, -1)
+        seen[order] = th.where(is_here, order[before.clamp(min=0)], -1)
+        by_age = seen[order[is_here]][ages[is_here].argsort(stable=True)]
+        sizes = th.bincount(ages[is_here], minlength=1)
+        is_met = sizes * len(sizes) >= MET * len(self)
+        return seen, th.cat([by_age, by_age.new_zeros(1)]), sizes.cumsum(0) - sizes, sizes, is_met
 
     def gather(self, starts: th.Tensor, length: int) -> Windows:
         """Return the windows at given starts.
@@ -109,7 +171,9 @@ class WindowSource:
 
     def to(self, device: th.device | str) -> WindowSource:
         """Return this source over copies of the arrays on a device; where they are there already, over the same."""
-        return WindowSource(**{field.name: getattr(self, field.name).to(device) for field in fields(self)})
+        arrays = {field.name: getattr(self, field.name) for field in fields(self)}
+        moved: dict[str, Any] = {name: array if array is None else array.to(device) for name, array in arrays.items()}
+        return WindowSource(**moved)
 
     def split(self, held_out: float, seed: int = 0) -> tuple[WindowSource, WindowSource]:
         """Split by episodes into a training and a held-out source, so that no step is in windows of both.
@@ -147,5 +211,5 @@ class WindowSource:
         return self.actions[self.rows, self.envs]
 
     def _select(self, keep: th.Tensor) -> WindowSource:
-        names = ("rows", "envs", "remaining", "values", "episodes")
+        names = ("rows", "envs", "remaining", "values", "episodes") + ("ages",) * (self.ages is not None)
         return replace(self, **{name: getattr(self, name)[keep] for name in names})

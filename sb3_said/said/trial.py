@@ -28,6 +28,12 @@ WAYS: dict[str, dict[str, Any]] = {
     "actor": {"decided_by": "actor"},
     "default": {"decided_by": "plan", "temperature": 0.0, "sampling_steps": PlannerConfig.sampling_steps},
     "one_step": {"decided_by": "plan", "temperature": 0.0, "sampling_steps": 1},
+    "inpainted": {
+        "decided_by": "plan",
+        "temperature": 0.0,
+        "sampling_steps": PlannerConfig.sampling_steps,
+        "present": "inpainted",
+    },  # what the present guessed makes of old observations, but for where that goes wrong
 }
 
 
@@ -58,8 +64,9 @@ def ways_of(
     if given is None:
         if set(SAMPLING_SETTINGS) & set(planner_kwargs):
             return {}
-        can_guess = own.present == "guessed"
-        return {name: way for name, way in WAYS.items() if can_guess or way["decided_by"] == "plan"}
+        if own.present == "inpainted":
+            return {name: WAYS[name] for name in ("weighed", "default", "one_step")}
+        return {name: way for name, way in WAYS.items() if name != "inpainted" or own.mask != "none"}
     for name, settings in given.items():
         if len(name) > NAME_LENGTH:
             raise ValueError(f"planner_ways has the name {name!r}; expected at most {NAME_LENGTH} letters.")

@@ -1,6 +1,7 @@
 """The planner's windows: pieces of single episodes, values and splits, against plain lists of episodes."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -181,6 +182,53 @@ def test_a_part_of_the_windows_starts_early_in_episodes(probability):
     np.testing.assert_allclose(counted, expected, atol=5 * np.sqrt(expected.max() / n))
     again = source.sample(n, 4, th.Generator().manual_seed(0), probability)
     assert all(th.equal(a, b) for a, b in zip(windows, again, strict=True))
+
+
+def aged(source, ages):
+    return replace(source, ages=th.as_tensor(ages))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.integers(1, 12), min_size=1, max_size=8), st.integers(0, 4), st.integers(0, 10_000), st.booleans())
+def test_windows_show_what_their_decision_was_made_on(lengths, largest, seed, is_cut):
+    rng, source = np.random.default_rng(seed), make_source(lengths)
+    steps = source.start_states()[:, 1].int().numpy()
+    ages = np.minimum(rng.integers(0, largest + 1, len(source)), steps)
+    source = aged(source, ages)._select(th.from_numpy(rng.permutation(len(source))))  # stored in any order
+    if is_cut and len(source) > 1:  # the observations of an episode's first decisions are in the other part
+        source = source.split(0.3, seed)[0]
+    here = {tuple(state) for state in source.start_states().int().tolist()}
+    made = {age: set() for age in range(largest + 2)}
+    for (episode, step), age in zip(source.start_states().int().tolist(), source.ages.tolist(), strict=True):
+        if (episode, step - age) in here:
+            made[age].add((episode, step - age))
+    n_ages = 1 + max((age for age in made if made[age]), default=0)
+    generator = th.Generator().manual_seed(seed)
+    for age, starts in made.items():
+        is_met = age < n_ages and len(starts) * n_ages >= 0.25 * len(source)
+        windows, delay = source.sample_own(th.full((400,), age), 3, generator)
+        drawn = {tuple(state) for state in windows.states[:, 0].int().tolist()}
+        assert delay.tolist() == [age] * 400 and drawn <= (starts if is_met else here)
+        assert windows.values.tolist() == pytest.approx((windows.states[:, 0, 1] / max(lengths)).tolist())
+        found = source.own_starts(age)
+        assert len(found) == (len(starts) if is_met else 0)
+        assert {tuple(state) for state in source.start_states()[found].int().tolist()} == (starts if is_met else set())
+    if made[0]:
+        windows, delay = source.sample_own(th.full((400,), largest + 1), 3, generator, early_probability=1.0)
+        for (episode, step), age in zip(windows.states[:, 0].int().tolist(), delay.tolist(), strict=True):
+            assert (episode, step) in (made[age] if age <= largest else here)  # of the decision drawn, or of none
+
+
+def test_decisions_of_an_age_are_drawn_evenly_and_of_a_rare_one_any():
+    source = aged(make_source([3, 30]), [0, 1, 1, *[0, 1], *[2] * 27, 1])
+    n = 60_000
+    for age, expected in ((0, 33 * [1 / 33]), (2, [*3 * [0], *27 * [1 / 27], *3 * [0]])):  # two of age 0 are too few
+        generator = th.Generator().manual_seed(0)
+        windows, delay = source.sample_own(th.full((n,), age), 3, generator)
+        counts = np.zeros(33)
+        np.add.at(counts, (3 * windows.states[:, 0, 0] + windows.states[:, 0, 1]).long().numpy(), 1 / n)
+        assert (delay == age).all()
+        np.testing.assert_allclose(counts, expected, atol=5 * np.sqrt(max(expected) / n))
 
 
 def test_a_short_episode_repeats_its_last_row():

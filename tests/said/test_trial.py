@@ -45,8 +45,8 @@ def test_returns_are_those_of_each_who_can_answer(trained):
     played = found.returns
     np.random.seed(3)
     seed = int(np.random.randint(2**31))
-    assert list(played) == ["weighed", "actor", "default", "one_step", "planner", "expert"]
-    assert found.n_steps == 6 * 3 * 15
+    assert list(played) == ["weighed", "actor", "default", "one_step", "inpainted", "planner", "expert"]
+    assert found.n_steps == 7 * 3 * 15
     assert set(found.ages) <= {0, 1, 2}
     assert trained.policy.planner.config == before
     for name, returns in played.items():
@@ -58,7 +58,7 @@ def test_returns_are_those_of_each_who_can_answer(trained):
                 expected = evaluate_policy(trained, env, 1)[0]
             assert found_return == pytest.approx(expected, rel=1e-5)
         trained.policy.planner.config = before
-    assert len({returns[0] for returns in played.values()}) == 6
+    assert len({returns[0] for returns in played.values()}) == 7
 
 
 def test_an_expert_that_has_not_learned_without_delay_acts_on_no_guess():
@@ -104,7 +104,7 @@ def test_a_way_that_the_planner_already_has_is_not_played_twice_and_the_way_back
         returns = trial.play_trial(trained, n_episodes=1).returns
     finally:
         trained.policy.planner.config = own
-    assert list(returns) == ["weighed", "actor", "default", "planner", "expert"]
+    assert list(returns) == ["weighed", "actor", "default", "planner", "inpainted", "expert"]
 
 
 @pytest.mark.parametrize(("means", "answers"), [((1, 2, 3, 0), "planner"), ((3, 2, 1, 4), "expert")])
@@ -348,7 +348,9 @@ def test_ways_that_are_given_are_checked_and_settings_of_the_users_own_are_kept(
     tiny = {"planner_kwargs": {"depth": 1, "d_model": 32}, "buffer_size": 100, "device": "cpu"}
     assert SAID("MlpPolicy", delayed(), **tiny).planner_ways == trial.WAYS
     blind = SAID("MlpPolicy", delayed(), **{**tiny, "planner_kwargs": {"d_model": 32, "first_guess": "none"}})
-    assert blind.planner_ways == {name: way for name, way in trial.WAYS.items() if name != "actor"}
+    assert [*blind.planner_ways] == ["weighed", "default", "one_step"]
+    ahead = SAID("MlpPolicy", delayed(), **{**tiny, "planner_kwargs": {"d_model": 32, "mask": "none"}})
+    assert [*ahead.planner_ways] == ["weighed", "actor", "default", "one_step"]  # it knows nothing but presents
     assert make().planner_ways == {}  # it has a temperature
     SAID("MlpPolicy", delayed(), **tiny).save(tmp_path / "said")
     assert SAID.load(tmp_path / "said").planner_ways == trial.WAYS
