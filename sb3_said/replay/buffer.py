@@ -363,14 +363,14 @@ class DelayedReplayBuffer(ReplayBuffer):
         grid = np.broadcast_to(rows[:, None], ends.shape), np.broadcast_to(np.arange(self.n_envs), ends.shape)
         remaining = last - np.arange(n_rows)[:, None] + 1
         episodes = last + np.arange(self.n_envs) * n_rows  # unique for each environment and end
-        per_start = (*grid, remaining, episodes, np.zeros(ends.shape, np.float32), self.ages[rows].astype(np.int64))
-        n_known = len(per_start) - self.holds_logs  # a log knows no ages
+        ages = () if self.holds_logs else (self.ages[rows].astype(np.int64),)  # a log knows none
+        per_start = (*grid, remaining, episodes, np.zeros(ends.shape, np.float32), *ages)
         return WindowSource(
             th.from_numpy(np.asarray(states, np.float32)),
             th.from_numpy(self.actions),
             th.from_numpy(self.rewards),
             th.from_numpy((self.dones > 0) & (self.timeouts == 0)),
-            *(th.from_numpy(x.flatten()) for x in per_start[:n_known]),  # a copy: the grid is read-only
+            *(th.from_numpy(x.flatten()) for x in per_start),  # a copy: the grid is read-only
         )
 
     def normalized(self, states: np.ndarray, env: VecNormalize) -> np.ndarray:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import torch as th
@@ -110,8 +112,9 @@ class WindowSource:
     def own_starts(self, age: int) -> th.Tensor:
         """Return the starts that decisions of an age were made on, and none where :meth:`sample_own` draws others."""
         _, by_age, firsts, sizes, is_met = self._seen
-        n = int(sizes[age]) if age < len(sizes) and is_met[age] else 0
-        return by_age[int(firsts[age]) :][:n] if n else by_age[:0]
+        if age >= len(sizes) or not is_met[age]:
+            return by_age[:0]
+        return by_age[int(firsts[age]) :][: int(sizes[age])]
 
     def _draw(
         self, batch_size: int, generator: th.Generator | None, early_probability: float
@@ -146,15 +149,16 @@ class WindowSource:
         """
         assert self.ages is not None  # for mypy: the callers have seen to it
         order, firsts, sizes = self._by_episode
-        place = th.arange(len(order), device=order.device)
-        before, ages = place - self.ages[order], self.ages[order]
+        ages = self.ages[order]
+        before = th.arange(len(order), device=order.device) - ages
         is_here = before >= firsts.repeat_interleave(sizes)  # in the same episode
         seen = th.full_like(order, -1)
         seen[order] = th.where(is_here, order[before.clamp(min=0)], -1)
         by_age = seen[order[is_here]][ages[is_here].argsort(stable=True)]
         sizes = th.bincount(ages[is_here], minlength=1)
         is_met = sizes * len(sizes) >= MET * len(self)
-        return seen, th.cat([by_age, by_age.new_zeros(1)]), sizes.cumsum(0) - sizes, sizes, is_met
+        by_age = th.cat([by_age, by_age.new_zeros(1)])  # a place for what is looked up of an age without any
+        return seen, by_age, sizes.cumsum(0) - sizes, sizes, is_met
 
     def gather(self, starts: th.Tensor, length: int) -> Windows:
         """Return the windows at given starts.
@@ -171,9 +175,7 @@ class WindowSource:
 
     def to(self, device: th.device | str) -> WindowSource:
         """Return this source over copies of the arrays on a device; where they are there already, over the same."""
-        arrays = {field.name: getattr(self, field.name) for field in fields(self)}
-        moved: dict[str, Any] = {name: array if array is None else array.to(device) for name, array in arrays.items()}
-        return WindowSource(**moved)
+        return self._with((field.name for field in fields(self)), lambda array: array.to(device))
 
     def split(self, held_out: float, seed: int = 0) -> tuple[WindowSource, WindowSource]:
         """Split by episodes into a training and a held-out source, so that no step is in windows of both.
@@ -211,5 +213,10 @@ class WindowSource:
         return self.actions[self.rows, self.envs]
 
     def _select(self, keep: th.Tensor) -> WindowSource:
-        names = ("rows", "envs", "remaining", "values", "episodes") + ("ages",) * (self.ages is not None)
-        return replace(self, **{name: getattr(self, name)[keep] for name in names})
+        return self._with(("rows", "envs", "remaining", "values", "episodes", "ages"), itemgetter(keep))
+
+    def _with(self, names: Iterable[str], change: Callable[[th.Tensor], th.Tensor]) -> WindowSource:
+        """Return this source with some arrays changed; ages that are not known stay so."""
+        arrays = {name: getattr(self, name) for name in names}
+        changed: dict[str, Any] = {name: x if x is None else change(x) for name, x in arrays.items()}
+        return replace(self, **changed)

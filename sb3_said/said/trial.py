@@ -20,7 +20,8 @@ CUT_AT = 10  # times the longest stored episode: a good answer may never end one
 NAME_LENGTH = 25  # of a way; SB3's log takes longer ones that begin alike for the same
 
 #: What a trial compares with an agent's own settings: the mean of all candidates, weighed by the critics; the expert's
-#: actor on the present that the planner's first guess has; the default's steps; and a single step. Which is best
+#: actor on the present that the planner's first guess has; the default's steps; a single step; and the default's steps
+#: where the present is inpainted with the plan, for a guess may go wrong at old observations. Which is best
 #: depends on task, delay and budget (measured, results/what_diffusion_buys.md and results/settings.md). Where the trial
 #: cannot tell, the order does: the first was best or second with each of seven planners.
 WAYS: dict[str, dict[str, Any]] = {
@@ -33,7 +34,7 @@ WAYS: dict[str, dict[str, Any]] = {
         "temperature": 0.0,
         "sampling_steps": PlannerConfig.sampling_steps,
         "present": "inpainted",
-    },  # what the present guessed makes of old observations, but for where that goes wrong
+    },
 }
 
 
@@ -64,9 +65,9 @@ def ways_of(
     if given is None:
         if set(SAMPLING_SETTINGS) & set(planner_kwargs):
             return {}
-        if own.present == "inpainted":
-            return {name: WAYS[name] for name in ("weighed", "default", "one_step")}
-        return {name: way for name, way in WAYS.items() if name != "inpainted" or own.mask != "none"}
+        guesses = own.present == "guessed"
+        is_another = {"actor": guesses, "inpainted": guesses and own.mask != "none"}
+        return {name: way for name, way in WAYS.items() if is_another.get(name, True)}
     for name, settings in given.items():
         if len(name) > NAME_LENGTH:
             raise ValueError(f"planner_ways has the name {name!r}; expected at most {NAME_LENGTH} letters.")

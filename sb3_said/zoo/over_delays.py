@@ -79,8 +79,9 @@ def main(argv: list[str] | None = None) -> None:
         if args.plot is not None:
             plots.check_file(args.plot)  # what cannot be drawn is told now, and not after the episodes
             check_writable(args.plot)
-        named: dict[str, int | str] = {}  # by process, which may be written in two ways: a second column of it would
-        for name in map(read_name, args.delays or ()):  # count as another training seed
+        # By process, which may be written in two ways: a second column of it would count as another training seed
+        named: dict[str, int | str] = {}
+        for name in map(read_name, args.delays or ()):
             named.setdefault(repr(make_process(name)), name)
         delays = list(named.values())
         playing = "algo", "env", "episodes", "seed", "device", "gym_packages", "n_envs", "workers"
