@@ -7,7 +7,9 @@ import hashlib
 import itertools
 import json
 import multiprocessing
+import os
 import re
+import threading
 import warnings
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -308,12 +310,25 @@ def play_all(cells: list[Cell], env_id: str, args: argparse.Namespace) -> Iterat
         yield from ((cell, play(cell, *how)) for cell in cells)
         return
     context = multiprocessing.get_context("spawn")  # forked processes would share torch's threads
-    pool = ProcessPoolExecutor(args.workers, context, initializer=th.set_num_threads, initargs=(args.num_threads,))
+    pool = ProcessPoolExecutor(args.workers, context, initializer=begin_worker, initargs=(args.num_threads,))
     try:
         futures = {pool.submit(play, cell, *how): cell for cell in cells}
         yield from ((futures[future], future.result()) for future in as_completed(futures))
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def begin_worker(num_threads: int) -> None:
+    """Prepare a process that plays cells: with so many threads, and for no longer than the one that asks it to."""
+    th.set_num_threads(num_threads)
+    parent = multiprocessing.parent_process()
+    assert parent is not None  # for mypy: a pool calls this
+
+    def end_with_it() -> None:  # whose pool would have ended this, if a kill -9 had let it
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=end_with_it, daemon=True).start()
 
 
 def play(

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import signal
+import subprocess
+import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -255,6 +258,21 @@ def test_workers_change_the_speed_only(said: Path, tmp_path: Path) -> None:
     one, two = (play(tmp_path / f"{n}.json", [said], delays, "--workers", n) for n in ("1", "2"))
     assert one["cells"] == two["cells"]
     assert [cell["result"] is None for cell in two["cells"]] == [False, True] * 2
+
+
+def test_workers_end_with_a_killed_command() -> None:
+    code = f"""if __name__ == "__main__":
+    import multiprocessing, os, signal
+    from concurrent.futures import ProcessPoolExecutor
+    from {over_delays.__name__} import begin_worker
+    spawn = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(1, spawn, initializer=begin_worker, initargs=(1,))
+    assert pool.submit(os.getpid).result() != os.getpid()
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+    # The worker holds the pipe, too, so reading it ends with the worker
+    killed = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, timeout=120)
+    assert killed.returncode == -signal.SIGKILL
 
 
 def test_a_delay_written_in_two_ways_is_played_once(
