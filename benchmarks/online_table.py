@@ -8,6 +8,7 @@ Each file is of sb3-said over-delays. Agents of one task, told apart by their fi
 SAID       both, each at its ages, where an agent's file shares them between planner and expert; else the planner, or
            the expert of files after --expert-answers, whose trial found it better
 intervals  95 %, by a bootstrap that draws training seeds, then episodes of each; of one seed over its episodes
+SAID more  SAID's return less its expert's, from the same reset seeds
 seeds      their own means over fixed delays, in the order of the files
 falls      part of all episodes that the task ended
 change     of the actions, from step to step
@@ -75,16 +76,23 @@ def returns_over(seeds: Seeds, delays: Sequence[int | str]) -> np.ndarray:
     return np.array([np.mean([result["returns"] for result in of_seed if result], axis=0) for of_seed in results])
 
 
+def gain_over(rows: Mapping[str, Seeds], delays: Sequence[int | str]) -> np.ndarray:
+    """Return what SAID has more than its expert in each episode, as :func:`returns_over`."""
+    played = [pair for pair in zip(rows[SAID], rows[EXPERT], strict=True) if set(delays) <= set(pair[0]) & set(pair[1])]
+    said, expert = (returns_over([pair[i] for pair in played], delays) for i in range(2))
+    return said - expert
+
+
 def written(returns: np.ndarray) -> str:
     """Write the mean of (n_seeds, n_episodes) with its interval."""
     if not len(returns):
         return "-"
     interval = confidence_interval(returns[0]) if len(returns) == 1 else stratified_interval(returns)
-    return f"{interval.value:,.0f} [{interval.low:,.0f}, {interval.high:,.0f}]"
+    return f"{round(interval.value):,} [{round(interval.low):,}, {round(interval.high):,}]"  # which writes no -0
 
 
 def show(found: Mapping[str, Mapping[str, Seeds]]) -> None:
-    """Print a Markdown table: SAID, its expert and the paper's SAID for each task."""
+    """Print a Markdown table: SAID, its expert, what SAID has more, and the paper's SAID for each task."""
     delays = list(dict.fromkeys(d for rows in found.values() for seeds in rows.values() for one in seeds for d in one))
     fixed, random = ([d for d in delays if isinstance(d, kind)] for kind in (int, str))
     columns = [*map(str, delays), "mean of fixed", "seeds", "mean of random", "worst tenth", "falls", "change"]
@@ -99,6 +107,9 @@ def show(found: Mapping[str, Mapping[str, Seeds]]) -> None:
             cells += ["-" if manners.ended is None else f"{manners.ended:.1%}"]
             cells += ["-" if manners.change is None else f"{manners.change:.3f}"]
             table.append({"task": env, "agent": row, **dict(zip(columns, cells, strict=True))})
+        over = {**{str(delay): [delay] for delay in delays}, "mean of fixed": fixed, "mean of random": random}
+        gains = {name: written(gain_over(rows, of)) if of else "-" for name, of in over.items()}
+        table.append({"task": env, "agent": "SAID more", **{name: gains.get(name, "") for name in columns}})
         paper = dict(zip(PAPER_DELAYS, PAPER.get(env, ()), strict=False))
         if paper:
             cells = [f"{paper[d][0]:,} ± {paper[d][1]}" if d in paper else "" for d in delays]

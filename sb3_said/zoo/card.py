@@ -197,7 +197,9 @@ def who_answers(model: Any) -> str:
     else:
         how = f" in {config.sampling_steps} denoising step{'s' * (config.sampling_steps > 1)}"
         how += f" at temperature {config.temperature:g}"
-        how += f", {config.n_candidates} candidates" * bool(config.temperature)
+        if config.temperature:
+            choice = "the one of the highest value decides" if config.choice_factor is None else "weighed by their values"
+            how += f", {config.n_candidates} candidates, {choice}"
     return (
         f"{who}{how}"
         if who == "planner"

@@ -50,7 +50,9 @@ def test_rows_are_worked_out_by_hand(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert columns["8"][0].startswith("1,960 [") and columns["mean of fixed"][0].startswith("1,980 [")
     assert columns["seeds"] == ["980, 2,980", "880, 2,880"] and columns["mean of random"][0].startswith("1,800 [")
     assert columns["falls"] == ["50.0%"] * 2 and columns["change"] == ["0.100"] * 2
-    assert lines[4][:4] == ["Hopper-v5", "SAID, paper", "3,170 ± 283", "2,514 ± 415"]
+    gain = "100 [100, 100]"
+    assert lines[4] == ["Hopper-v5", "SAID more", gain, gain, gain, gain, "", gain]
+    assert lines[5][:4] == ["Hopper-v5", "SAID, paper", "3,170 ± 283", "2,514 ± 415"]
     assert (tmp_path / "agents.png").read_bytes()[:4] == b"\x89PNG"
 
 

@@ -31,7 +31,7 @@ def test_tables_are_those_of_the_raw_files(monkeypatch, capsys):
     found = {tuple(row[:2]): dict(zip(header, row, strict=True)) for row in rows}
 
     header, _, *rows = rows_of(Path("results/agents.md").read_text(), "| task | agent |")
-    assert len(rows) == 8
+    assert len(rows) == 12
     for row in rows:
         assert [found[row[0], row[1]][name] for name in header] == row
 

@@ -96,6 +96,15 @@ def test_an_agent_of_logs_has_met_all_ages_of_its_delay(run: Path) -> None:
     assert "| gradient steps, on logs | 60 |" in facts
 
 
+def test_the_card_says_how_candidates_decide(run: Path) -> None:
+    model: Any = load_run(run, device="cpu").model
+    model.set_answer("planner")
+    model.set_planner(temperature=1.0, n_candidates=3)
+    assert card.who_answers(model).endswith("at temperature 1, 3 candidates, the one of the highest value decides")
+    model.set_planner(choice_factor=1.0)
+    assert card.who_answers(model).endswith("at temperature 1, 3 candidates, weighed by their values")
+
+
 def test_the_trials_steps_are_those_of_the_log(tmp_path: Path) -> None:
     assert card.trial_steps(tmp_path) == 0
     (tmp_path / "progress.csv").write_text("time,trial/steps,x\n1,,2\n2,340.0,\n3,60.0,\n")
