@@ -95,26 +95,26 @@ def show(found: Mapping[str, Mapping[str, Seeds]]) -> None:
     """Print a Markdown table: SAID, its expert, what SAID has more, and the paper's SAID for each task."""
     delays = list(dict.fromkeys(d for rows in found.values() for seeds in rows.values() for one in seeds for d in one))
     fixed, random = ([d for d in delays if isinstance(d, kind)] for kind in (int, str))
+    over = {**{str(delay): [delay] for delay in delays}, "mean of fixed": fixed, "mean of random": random}
     columns = [*map(str, delays), "mean of fixed", "seeds", "mean of random", "worst tenth", "falls", "change"]
     table = []
     for env, rows in found.items():
         for row, seeds in rows.items():
             of_fixed, manners = returns_over(seeds, fixed), manners_of(cell for one in seeds for cell in one.values())
             assert manners is not None  # as `read` has seen to
-            cells = [written(returns_over(seeds, [delay])) for delay in delays]
-            cells += [written(of_fixed), ", ".join(f"{of_seed.mean():,.0f}" for of_seed in of_fixed)]
-            cells += [written(returns_over(seeds, random)) if random else "-", f"{manners.worst_tenth:,.0f}"]
-            cells += ["-" if manners.ended is None else f"{manners.ended:.1%}"]
-            cells += ["-" if manners.change is None else f"{manners.change:.3f}"]
-            table.append({"task": env, "agent": row, **dict(zip(columns, cells, strict=True))})
-        over = {**{str(delay): [delay] for delay in delays}, "mean of fixed": fixed, "mean of random": random}
+            cells = {name: written(returns_over(seeds, of)) if of else "-" for name, of in over.items()} | {
+                "seeds": ", ".join(f"{of_seed.mean():,.0f}" for of_seed in of_fixed),
+                "worst tenth": f"{manners.worst_tenth:,.0f}",
+                "falls": "-" if manners.ended is None else f"{manners.ended:.1%}",
+                "change": "-" if manners.change is None else f"{manners.change:.3f}",
+            }
+            table.append({"task": env, "agent": row, **{name: cells[name] for name in columns}})
         gains = {name: written(gain_over(rows, of)) if of else "-" for name, of in over.items()}
         table.append({"task": env, "agent": "SAID more", **{name: gains.get(name, "") for name in columns}})
         paper = dict(zip(PAPER_DELAYS, PAPER.get(env, ()), strict=False))
         if paper:
-            cells = [f"{paper[d][0]:,} ± {paper[d][1]}" if d in paper else "" for d in delays]
-            cells += [""] * (len(columns) - len(delays))
-            table.append({"task": env, "agent": "SAID, paper", **dict(zip(columns, cells, strict=True))})
+            told = {str(d): f"{mean:,} ± {error}" for d, (mean, error) in paper.items()}
+            table.append({"task": env, "agent": "SAID, paper", **{name: told.get(name, "") for name in columns}})
     print_table(table)
 
 

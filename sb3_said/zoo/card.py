@@ -198,9 +198,8 @@ def who_answers(model: Any) -> str:
         how = f" in {config.sampling_steps} denoising step{'s' * (config.sampling_steps > 1)}"
         how += f" at temperature {config.temperature:g}"
         if config.temperature:
-            choice = "the one of the highest value decides"
-            choice = choice if config.choice_factor is None else "weighed by their values"
-            how += f", {config.n_candidates} candidates, {choice}"
+            how += f", {config.n_candidates} candidates, "
+            how += "the one of the highest value decides" if config.choice_factor is None else "weighed by their values"
     return (
         f"{who}{how}"
         if who == "planner"
