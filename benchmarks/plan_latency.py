@@ -93,7 +93,7 @@ def make_agent(setting: Setting, device: str) -> SAID:
 
 
 def with_first_guess(setting: Setting) -> Setting:
-    """Return the setting with the default's first guess, and the present that goes with it."""
+    """Return the setting with the default's first guess, and its present too where the planner knows age 0."""
     return setting._replace(config=replace(setting.config, first_guess="prior", present=None))
 
 

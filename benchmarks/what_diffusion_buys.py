@@ -200,7 +200,7 @@ def learn_values(model: SAID, updates: int) -> None:
 
 def preset_of(model: SAID, args: argparse.Namespace) -> PlannerConfig:
     """Return the settings of SAID's row, whatever the run's trial chose."""
-    return replace(model.policy.planner.config, **{**WAYS["default"], **args.planner_kwargs})
+    return replace(model.policy.planner.config, **WAYS["default"], **args.planner_kwargs)
 
 
 def players(model: SAID, rows: list[str], args: argparse.Namespace) -> Iterator[tuple[str, int | None, Any]]:
@@ -236,7 +236,7 @@ def players(model: SAID, rows: list[str], args: argparse.Namespace) -> Iterator[
                     continue
                 if row == "chosen by V":
                     learn_values(model, args.updates)
-                policy.planner.config = replace(preset, **{**how, "present": how.get("present") or preset.present})
+                policy.planner.config = replace(preset, **how)
                 with policy.answering("planner"):
                     yield row, seed, AllAtOnce(model)
             policy.set_value("critics")

@@ -63,12 +63,11 @@ class PlannerConfig:
     # has one start for a thousand steps, and a planner that falls there never gets to the rest: without, two of three
     # planners of one replay did (measured, results/what_diffusion_buys.md). 0 is the paper's; in [0, 1]
     early_probability: float = 0.25
-    # Which actions a training window shows: "random": those of a delay drawn from 0..max_delay, so that one network
-    # serves all; "own": the same, in windows whose decision was made on an observation of that age, where the data know
-    # it, as an agent may do one thing on new observations and another on old ones (measured,
-    # results/what_diffusion_buys.md); "fixed": those of max_delay (paper); "none": no action, so that every window
-    # begins at the present and has horizon steps, and the first guess goes there from an old observation
-    mask: str = "own"
+    # Which actions a training window shows: those of a delay drawn from 0..max_delay, so that one network serves all;
+    # "own": the same, in windows whose decision was made on an observation of that age, where the data know it;
+    # "fixed": those of max_delay (paper); "none": no action, so that every window begins at the present and has horizon
+    # steps, and the first guess goes there from an old observation
+    mask: str = "random"
     mask_end_probability: float = 0.5  # a guess: the longest mask is the hardest; in [0, 1]
     # Part of the training windows that show more states than the first, any subset of those up to the decision index:
     # 0 is the paper's; above it, late observations can be given to plan(), and 0.5 is a guess; in [0, 1]
@@ -148,8 +147,7 @@ class PlannerConfig:
         """:raises ValueError: for a guessed present where nothing guesses, and any other where none is inpainted"""
         can_guess = self.first_guess != "none" and self.mask != "fixed"
         if self.present is None:
-            # A planner of decisions of their own age, shown a guess as if it were seen, does what is done at age 0
-            is_guessed = can_guess and (self.mask != "own" or self.decided_by == "actor")
+            is_guessed = can_guess and self.mask != "own"  # who plans as if it saw the guess does what is done at age 0
             object.__setattr__(self, "present", "guessed" if is_guessed else "inpainted")
         if self.present == "guessed" and not can_guess:
             raise ValueError(
@@ -165,15 +163,6 @@ class PlannerConfig:
             raise ValueError(
                 f"decided_by is 'actor' with present={self.present!r}; expected present='guessed', where it acts."
             )
-
-    def changed(self, **settings: Any) -> PlannerConfig:
-        """Return these settings with others in their place; where another decides, ``present`` is its default, too.
-
-        :raises ValueError: as the constructor
-        """
-        if settings.get("decided_by", self.decided_by) != self.decided_by:
-            settings = {"present": None, **settings}
-        return replace(self, **settings)
 
     def to_dict(self) -> dict[str, Any]:
         """Return every setting in JSON types, as it comes back from a file."""

@@ -220,8 +220,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         check_scored(settings, self.policy.values is not None)
         if settings.get("decided_by") == "actor" and not self.has_expert:
             raise ValueError("decided_by='actor' lets the expert's actor decide, which this agent has not trained.")
-        self.policy.planner.config = self.policy.planner.config.changed(**settings)
-        self._given_planner_kwargs = {**self._given_planner_kwargs, **settings}
+        self.policy.planner.config = replace(self.policy.planner.config, **settings)
 
     def set_answer(self, who: Answer, expert_up_to: int | None = None, expert_from: int | None = None) -> None:
         """Let one of them answer ``predict`` from now on, or two: see :meth:`SAIDPolicy.set_answer`.
@@ -300,11 +299,6 @@ class SAID(OfflineAlgorithm, StableSAC):
         steps = self.planner_gradient_steps if gradient_steps is None else _count("gradient_steps", gradient_steps)
         replay, newest, env = self.replay_buffer, self.newest_fraction, self._vec_normalize_env
         source = replay.window_source(newest, env)
-        config = self.policy.planner.config
-        if config.mask == "own" and self._given_planner_kwargs.get("present") is None:
-            mask = "random" if source.ages is None else "own"  # logs do not say at which age a decision was made
-            present = replace(config, mask=mask, present=None).present
-            self.policy.planner.config = replace(config, present=present)
         has_older = len(source) < replay.size() * replay.n_envs  # a log's replay has one, whatever the agent has
         bootstrap = self._stored_values if self.has_expert else None  # offline there are no critics
         values = returns_to_go(source, self.gamma, self.planner_terminal_penalty, bootstrap)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -20,20 +19,22 @@ SAID = Any  # whose module imports this one
 CUT_AT = 10  # times the longest stored episode: a good answer may never end one
 NAME_LENGTH = 25  # of a way; SB3's log takes longer ones that begin alike for the same
 
-PLAN = {"decided_by": "plan", "present": None}  # where the planner's mask would have it
-DEFAULT = {**PLAN, "temperature": 0.0, "sampling_steps": PlannerConfig.sampling_steps}
 #: What a trial compares with an agent's own settings: the mean of all candidates, weighed by the critics; the expert's
 #: actor on the present that the planner's first guess has; the default's steps; a single step; and the default's steps
-#: where the present is inpainted with the plan, for a guess may go wrong at old observations, and where it is guessed.
-#: Which is best depends on task, delay and budget (measured, results/what_diffusion_buys.md and results/settings.md).
-#: Where the trial cannot tell, the order does: the first was best or second with each of seven planners.
+#: where the present is inpainted with the plan, for a guess may go wrong at old observations. Which is best
+#: depends on task, delay and budget (measured, results/what_diffusion_buys.md and results/settings.md). Where the trial
+#: cannot tell, the order does: the first was best or second with each of seven planners.
 WAYS: dict[str, dict[str, Any]] = {
-    "weighed": {**PLAN, "temperature": 1.0, "sampling_steps": 2, "choice_factor": 1.0},
-    "actor": {"decided_by": "actor", "present": None},
-    "default": DEFAULT,
-    "one_step": {**DEFAULT, "sampling_steps": 1},
-    "inpainted": {**DEFAULT, "present": "inpainted"},
-    "guessed": {**DEFAULT, "present": "guessed"},
+    "weighed": {"decided_by": "plan", "temperature": 1.0, "sampling_steps": 2, "choice_factor": 1.0},
+    "actor": {"decided_by": "actor"},
+    "default": {"decided_by": "plan", "temperature": 0.0, "sampling_steps": PlannerConfig.sampling_steps},
+    "one_step": {"decided_by": "plan", "temperature": 0.0, "sampling_steps": 1},
+    "inpainted": {
+        "decided_by": "plan",
+        "temperature": 0.0,
+        "sampling_steps": PlannerConfig.sampling_steps,
+        "present": "inpainted",
+    },
 }
 
 
@@ -54,8 +55,7 @@ class Trial:
 def ways_of(
     given: dict[str, dict[str, Any]] | None, planner_kwargs: dict[str, Any], value: str
 ) -> dict[str, dict[str, Any]]:
-    """Return the ways to compare: those given, or those of ``WAYS`` that this planner has and that differ; none where
-    ``planner_kwargs`` says how to decide.
+    """Return the ways to compare: those given, or ``WAYS``; none where ``planner_kwargs`` says how to decide.
 
     :param value: who scores candidates, as of :class:`~sb3_said.said.SAID`
     :raises ValueError: for other settings than those of ``set_planner``, and for values outside their range, or that
@@ -65,11 +65,9 @@ def ways_of(
     if given is None:
         if set(SAMPLING_SETTINGS) & set(planner_kwargs):
             return {}
-        had: dict[PlannerConfig, str] = {}
-        for name, way in WAYS.items():
-            with suppress(ValueError):  # of a planner that cannot guess a present, or not inpaint one
-                had.setdefault(replace(own, **way), name)
-        return {name: WAYS[name] for name in had.values()}
+        guesses = own.present == "guessed"
+        is_another = {"actor": guesses, "inpainted": guesses and own.mask != "none"}
+        return {name: way for name, way in WAYS.items() if is_another.get(name, True)}
     for name, settings in given.items():
         if len(name) > NAME_LENGTH:
             raise ValueError(f"planner_ways has the name {name!r}; expected at most {NAME_LENGTH} letters.")
@@ -91,9 +89,9 @@ def in_way(own: PlannerConfig, settings: dict[str, Any]) -> PlannerConfig:
     :raises ValueError: for values outside their range, or that this planner cannot have
     """
     try:
-        return own.changed(**settings)
-    except ValueError:  # such as of an inpainted present, where the actor decides now
-        return own.changed(**{"decided_by": "plan", **settings})
+        return replace(own, **settings)
+    except ValueError:  # such as of the actor, where the agent inpaints the present now
+        return replace(own, **{"decided_by": "plan", "present": PlannerConfig.present, **settings})
 
 
 def _configs(model: SAID) -> dict[str, PlannerConfig]:

@@ -66,7 +66,7 @@ def test_flops_grow_with_each_size():
 def test_every_setting_is_timed_with_a_first_guess_too():
     guessing = [plan_latency.with_first_guess(setting).config for setting in plan_latency.SETTINGS]
     assert {config.first_guess for config in guessing} == {"prior"}
-    assert [config.present for config in guessing] == ["inpainted"] * 5  # as the masks "fixed" and "own" have it
+    assert [config.present for config in guessing] == ["inpainted"] * 2 + ["guessed"] * 3
 
 
 def test_line_through_points():

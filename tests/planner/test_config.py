@@ -23,25 +23,15 @@ def test_paper_config_is_the_papers_table():
 def test_settings_of_sampling_do_not_decide_the_weights():
     config = PlannerConfig()
     others = dict(sampling_steps=1, n_candidates=2, temperature=1.0, scored_states="all", choice_factor=1.0)
-    others |= {"decided_by": "actor", "present": "guessed"}
+    others["decided_by"] = "actor"
     assert dataclasses.replace(config, **others).weight_settings() == config.weight_settings()
     assert dataclasses.replace(config, depth=4).weight_settings() != config.weight_settings()
 
 
 def test_a_plan_begins_at_the_guessed_present_where_there_is_one():
-    assert PlannerConfig(mask="random").present == PlannerConfig(mask="none").present == "guessed"
-    assert PlannerConfig(mask="random", first_guess="none").present == "inpainted"
-    assert PlannerConfig(mask="fixed").present == "inpainted"
-    assert PlannerConfig(mask="random", present="inpainted").present == "inpainted"
-
-
-def test_a_planner_of_decisions_of_their_own_age_inpaints_the_present_unless_the_actor_decides_there():
-    assert PlannerConfig(mask="own").present == "inpainted"
-    assert PlannerConfig(mask="own", present="guessed").present == "guessed"
-    acting = PlannerConfig(mask="own").changed(decided_by="actor")
-    assert acting.present == PlannerConfig(mask="own", decided_by="actor").present == "guessed"
-    assert acting.changed(decided_by="plan").present == "inpainted"
-    assert acting.changed(decided_by="plan", present="guessed").present == "guessed"
+    assert PlannerConfig().present == PlannerConfig(mask="none").present == "guessed"
+    assert PlannerConfig(first_guess="none").present == PlannerConfig(mask="fixed").present == "inpainted"
+    assert PlannerConfig(present="inpainted").present == "inpainted"
 
 
 def test_config_survives_json():

@@ -72,3 +72,8 @@ def test_where_the_data_know_no_ages_delays_are_drawn_as_at_random():
     source = replace(make_source(), ages=None)
     weights = [train(mask, source, 5).planner.state_dict() for mask in ("own", "random")]
     assert all(th.equal(a, b) for a, b in zip(weights[0].values(), weights[1].values(), strict=True))
+
+
+def test_the_present_is_inpainted_unless_asked():
+    assert PlannerConfig(mask="own").present == "inpainted"
+    assert PlannerConfig(mask="own", present="guessed").present == "guessed"

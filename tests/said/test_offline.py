@@ -62,15 +62,6 @@ def test_the_planner_answers_after_learning_from_logs(learned, tmp_path):
     assert loaded.value == "iql"
 
 
-def test_a_plan_begins_at_the_guess_where_logs_do_not_say_at_which_age_a_decision_was_made(learned):
-    assert learned.policy.planner.config.mask == "own" and learned.policy.planner.config.present == "guessed"
-    told = make()
-    told.set_planner(present="inpainted")
-    assert learn(told).policy.planner.config.present == "inpainted"
-    online = learn(make(learning_starts=5)).learn(60)  # on steps of its own, whose ages are known
-    assert online.policy.planner.config.present == "inpainted"
-
-
 def test_v_is_learned_as_told_and_a_file_keeps_how(tmp_path):
     given = {"expectile": 0.9, "hidden": 16, "updates": 3}
     model = make(iql_kwargs=given)

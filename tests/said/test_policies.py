@@ -464,7 +464,7 @@ def test_the_actor_decides_on_the_guessed_present_as_if_it_saw_it(saved, tmp_pat
     np.testing.assert_array_equal(answer(SAID.load(tmp_path / "actor.zip", device="cpu"), obs), answer(model, obs))
     with pytest.warns(UserWarning, match="learned at ages 2 and is given 0"):  # by the guess
         model.check_ages([2])
-    model.set_planner(decided_by="plan", present="guessed")
+    model.set_planner(decided_by="plan")
     np.testing.assert_array_equal(model.predict_plan(obs, deterministic=True)[:, 1:], plans[:, 1:])
     assert not np.allclose(answer(model, obs), plans[:, 0])
 

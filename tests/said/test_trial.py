@@ -35,8 +35,7 @@ def pendulum(n_steps=15, delay=2):
 
 @pytest.fixture(scope="module")
 def trained():
-    ways = {name: way for name, way in trial.WAYS.items() if name != "inpainted"}  # as the default is
-    return make(env=pendulum(delay=(0, 2)), planner_ways=ways).learn(60)
+    return make(env=pendulum(delay=(0, 2)), planner_ways=trial.WAYS).learn(60)
 
 
 def test_returns_are_those_of_each_who_can_answer(trained):
@@ -46,7 +45,7 @@ def test_returns_are_those_of_each_who_can_answer(trained):
     played = found.returns
     np.random.seed(3)
     seed = int(np.random.randint(2**31))
-    assert list(played) == ["weighed", "actor", "default", "one_step", "guessed", "planner", "expert"]
+    assert list(played) == ["weighed", "actor", "default", "one_step", "inpainted", "planner", "expert"]
     assert found.n_steps == 7 * 3 * 15
     assert set(found.ages) <= {0, 1, 2}
     assert trained.policy.planner.config == before
@@ -105,7 +104,7 @@ def test_a_way_that_the_planner_already_has_is_not_played_twice_and_the_way_back
         returns = trial.play_trial(trained, n_episodes=1).returns
     finally:
         trained.policy.planner.config = own
-    assert list(returns) == ["weighed", "actor", "default", "planner", "guessed", "expert"]
+    assert list(returns) == ["weighed", "actor", "default", "planner", "inpainted", "expert"]
 
 
 @pytest.mark.parametrize(("means", "answers"), [((1, 2, 3, 0), "planner"), ((3, 2, 1, 4), "expert")])
@@ -347,18 +346,15 @@ def test_both_answer_where_each_does_better(age, expert_ages, monkeypatch, tmp_p
 
 def test_ways_that_are_given_are_checked_and_settings_of_the_users_own_are_kept(tmp_path):
     tiny = {"planner_kwargs": {"depth": 1, "d_model": 32}, "buffer_size": 100, "device": "cpu"}
-    ways = {name: trial.WAYS[name] for name in ("weighed", "actor", "default", "one_step", "guessed")}
-    assert SAID("MlpPolicy", delayed(), **tiny).planner_ways == ways
-    mixed = SAID("MlpPolicy", delayed(), **{**tiny, "planner_kwargs": {"d_model": 32, "mask": "random"}})
-    assert [*mixed.planner_ways] == ["weighed", "actor", "default", "one_step", "inpainted"]
+    assert SAID("MlpPolicy", delayed(), **tiny).planner_ways == trial.WAYS
     blind = SAID("MlpPolicy", delayed(), **{**tiny, "planner_kwargs": {"d_model": 32, "first_guess": "none"}})
     assert [*blind.planner_ways] == ["weighed", "default", "one_step"]
     ahead = SAID("MlpPolicy", delayed(), **{**tiny, "planner_kwargs": {"d_model": 32, "mask": "none"}})
     assert [*ahead.planner_ways] == ["weighed", "actor", "default", "one_step"]  # it knows nothing but presents
     assert make().planner_ways == {}  # it has a temperature
     SAID("MlpPolicy", delayed(), **tiny).save(tmp_path / "said")
-    assert SAID.load(tmp_path / "said").planner_ways == ways
-    assert SAID.load(tmp_path / "said", planner_kwargs={"decision_weight": 2.0}).planner_ways == ways
+    assert SAID.load(tmp_path / "said").planner_ways == trial.WAYS
+    assert SAID.load(tmp_path / "said", planner_kwargs={"decision_weight": 2.0}).planner_ways == trial.WAYS
     assert SAID.load(tmp_path / "said", planner_kwargs={"temperature": 0.5}).planner_ways == {}
     own = {"own": {"sampling_steps": 3}}
     assert SAID.load(tmp_path / "said", planner_kwargs={"temperature": 0.5}, planner_ways=own).planner_ways == own
