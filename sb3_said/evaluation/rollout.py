@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 Observation = Any  # one array, or a dict of arrays; batched with a leading axis where a docstring says (B, ...)
 EnvMaker = str | Callable[[], gym.Env[Any, Any]]
 State = tuple[np.ndarray, ...] | None
+
+LONG = 10_000  # steps of an episode that may have no end, ten times those of MuJoCo's tasks
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,8 @@ def rollout(
     The environments step in lock-step, so that one call of ``predict`` decides for all of them. The next episode goes
     to the first environment that is free; an environment without a further episode leaves the batch. Hence exactly
     ``n_episodes`` episodes count, and short ones are not over-represented. Returns do not depend on ``n_envs`` as long
-    as ``predict`` answers each row by itself (batched arithmetic may still differ in the last bits).
+    as ``predict`` answers each row by itself (batched arithmetic may still differ in the last bits). An episode is
+    played to its end, however long; one of ``LONG`` steps is warned of.
 
     :param model: anything with the ``predict`` of Stable-Baselines3
     :param env: an environment id, or a function that makes an environment
@@ -98,6 +102,13 @@ def rollout(
                 ended[episode] = terminated
                 changes[episode] += np.mean(np.abs(actions[row] - before.get(episode, actions[row])) / half_range)
                 before[episode] = np.array(actions[row])  # of a model that may write all its answers into one array
+                if lengths[episode] == LONG and not (terminated or truncated):
+                    warnings.warn(
+                        f"Episode {episode} has not ended after {LONG:,} steps, and is waited for. If it need never "
+                        "end, register the task with max_episode_steps, or train it with "
+                        "--env-kwargs max_episode_steps:1000.",
+                        stacklevel=2,
+                    )
                 if on_step is not None:
                     on_step(e)
                 if terminated or truncated:

@@ -144,6 +144,17 @@ def test_below_wrappers_that_change_rewards_a_monitor_counts_the_tasks_own() -> 
     np.testing.assert_allclose(own, returns, atol=1e-5)
 
 
+def test_an_episode_that_may_have_no_end_is_warned_of_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, lengths = by_hand(6)
+    long = sorted(lengths)[-2]  # which ends right there, and one goes on
+    monkeypatch.setattr(importlib.import_module("sb3_said.evaluation.rollout"), "LONG", long)
+    with pytest.warns(UserWarning, match="not ended after .*max_episode_steps") as said:
+        result = rollout(Model(), Countdown, 6, SEED, n_envs=2)
+    assert result.lengths.tolist() == lengths
+    assert [str(w.message).split()[1] for w in said] == [str(i) for i, n in enumerate(lengths) if n > long]
+    assert len(said) == 1
+
+
 def test_environments_that_are_done_leave_the_batch() -> None:
     model = Model()
     result = rollout(model, Countdown, 4, SEED, n_envs=4)
