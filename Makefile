@@ -1,6 +1,6 @@
 # make install   the virtual environment .venv, with everything
 # make train     trains SAID on a MuJoCo task under delay, evaluates it beside its expert and draws a plot
-# make report    README's table and picture, from the raw files of results/
+# make report    README's table and picture, from the raw files of results/; with EACH=--each every training seed's table
 # make demo      draws demo.gif: a trained agent under delay, beside itself as if it did not know of it
 # make test      lint, types and tests: what CI runs
 # make format    rewrites the code as `make lint` wants it
@@ -46,7 +46,7 @@ train: install
 
 report: install
 	$(PY) benchmarks/online_table.py $(AGENTS:%=results/agents/%.json) \
-		--expert-answers $(EXPERTS:%=results/agents/%.json) --plot results/agents/agents.png
+		--expert-answers $(EXPERTS:%=results/agents/%.json) --plot results/agents/agents.png $(EACH)
 
 demo: install
 	$(PY) scripts/enjoy.py agents/hopper.zip --delay 8 --beside-ignorant --size 240 --fps 12 --record demo.gif

@@ -14,6 +14,8 @@ falls      part of all episodes that the task ended
 change     of the actions, from step to step
 paper      what Table 1 of arXiv 2603.01553 has for SAID, mean and standard error: an agent for each delay, 5 M steps
 plot       thin lines are training seeds
+
+With --each the table has rows of every training seed by itself.
 """
 
 from __future__ import annotations
@@ -118,6 +120,15 @@ def show(found: Mapping[str, Mapping[str, Seeds]]) -> None:
     print_table(table)
 
 
+def each_by_itself(found: Mapping[str, Mapping[str, Seeds]]) -> dict[str, dict[str, Seeds]]:
+    """Return the same with every training seed as a task of its own, numbered in the order of the files."""
+    return {
+        f"{env}, seed {i + 1}": {row: [seeds[i]] for row, seeds in rows.items()}
+        for env, rows in found.items()
+        for i in range(len(rows[SAID]))
+    }
+
+
 def plot(found: Mapping[str, Mapping[str, Seeds]], path: Path) -> None:
     """Draw a panel for each task: return over fixed delays, each training seed thin and their mean thick."""
     axes = plots.panels(len(found), width=4.6, height=3.2)
@@ -148,13 +159,14 @@ def main(argv: list[str] | None = None) -> dict[str, dict[str, Seeds]]:
     p.add_argument("files", nargs="+", type=Path, metavar="JSON")
     p.add_argument("--expert-answers", nargs="+", type=Path, default=[], metavar="JSON", help="files of agents that "
                    "answer by their expert")  # fmt: skip
+    p.add_argument("--each", action="store_true", help="rows of every training seed by itself")
     p.add_argument("--plot", type=Path, metavar="PNG", help="draw return over fixed delays, a panel for each task")
     args = p.parse_args(argv)
     try:
         found = read(args.files, args.expert_answers)
     except ValueError as error:
         p.error(str(error))
-    show(found)
+    show(each_by_itself(found) if args.each else found)
     if args.plot:
         plot(found, args.plot)
     return found

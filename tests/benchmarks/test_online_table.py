@@ -56,6 +56,24 @@ def test_rows_are_worked_out_by_hand(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert (tmp_path / "agents.png").read_bytes()[:4] == b"\x89PNG"
 
 
+def test_every_seed_by_itself_is_the_table_of_its_file_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = [
+        write(tmp_path / f"{name}.json", seed(name, "planner", m), env="Own-v0") for name, m in (("a", 1e3), ("b", 3e3))
+    ]
+
+    def rows(*argv: str) -> list[str]:
+        online_table.main([*argv, "--each"])
+        return [line for line in capsys.readouterr().out.splitlines() if "Own-v0" in line]
+
+    first, second = (rows(file) for file in files)
+    together = rows(*files)
+    assert together == [*first, *(line.replace("seed 1", "seed 2") for line in second)]
+    assert [line.split(" | ")[0] for line in together] == ["| Own-v0, seed 1"] * 3 + ["| Own-v0, seed 2"] * 3
+    assert together[0].split(" | ")[2].startswith("1,000 [") and together[3].split(" | ")[2].startswith("3,000 [")
+
+
 def test_an_agent_that_its_trial_lets_the_expert_answer_is_its_expert(tmp_path: Path) -> None:
     ours = write(tmp_path / "a.json", seed("a", "planner", 1000.0))
     theirs = write(tmp_path / "b.json", seed("b", "planner", 3000.0))
