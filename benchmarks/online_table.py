@@ -45,13 +45,13 @@ Seeds = list[dict[int | str, Cell]]  # for each training seed its cell by delay
 def read(paths: Iterable[Path], by_expert: Iterable[Path] = ()) -> dict[str, dict[str, Seeds]]:
     """Return by task and row what each training seed played.
 
-    :param by_expert: files of agents that answer by their expert
+    :param by_expert: files of agents that answer by their expert, whether or not they are among the others
     :raises ValueError: for files of other episodes, an agent in two files, or one that has no row of SAID
     """
     found: dict[str, dict[str, Seeds]] = {}
     episodes: dict[str, dict[str, object]] = {}
     files: dict[str, Path] = {}
-    for path in [*paths, *by_expert]:
+    for path in dict.fromkeys([*paths, *by_expert]):
         results = Results(path)
         env = str(results.settings["env"])
         if episodes.setdefault(env, results.settings) != results.settings:

@@ -80,6 +80,9 @@ def test_an_agent_that_its_trial_lets_the_expert_answer_is_its_expert(tmp_path: 
     found = online_table.main([ours, "--expert-answers", theirs])["Hopper-v5"]
     means = {row: online_table.returns_over(seeds, [0]).mean(1).tolist() for row, seeds in found.items()}
     assert means == {"SAID": [1000.0, 2900.0], "its expert": [900.0, 2900.0]}
+    found = online_table.main([theirs, ours, "--expert-answers", theirs])["Hopper-v5"]  # in the order of all
+    means = {row: online_table.returns_over(seeds, [0]).mean(1).tolist() for row, seeds in found.items()}
+    assert means == {"SAID": [2900.0, 1000.0], "its expert": [2900.0, 900.0]}
 
 
 def test_a_seed_that_has_not_played_a_delay_counts_in_no_mean_over_it(tmp_path: Path) -> None:
