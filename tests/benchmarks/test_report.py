@@ -27,16 +27,16 @@ def test_tables_are_those_of_the_raw_files(monkeypatch, capsys):
     python, script, *arguments = shlex.split(printed.replace("\\\n", " "))
     assert (python, script) == ("python", "benchmarks/online_table.py") and arguments[-2] == "--plot"
     page = Path("results/agents.md").read_text()
-    online_table.main([*arguments[:-2], "--each"])
-    each = rows_of(page[page.index("## Each training seed") :], "| task | agent |")
-    assert len(each) == 2 + 12 * 3
-    assert each == rows_of(capsys.readouterr().out, "| task | agent |")
-    online_table.main(arguments[:-2])
+    seeds = online_table.main(arguments[:-2])
     header, _, *rows = rows_of(capsys.readouterr().out, "| task | agent |")
     found = {tuple(row[:2]): dict(zip(header, row, strict=True)) for row in rows}
 
     header, _, *rows = rows_of(page, "| task | agent |")
     assert len(rows) == 12
+    online_table.show(online_table.each_by_itself(seeds))
+    each = rows_of(page[page.index("## Each training seed") :], "| task | agent |")
+    assert len(each) == 2 + 12 * 3
+    assert each == rows_of(capsys.readouterr().out, "| task | agent |")
     for row in rows:
         assert [found[row[0], row[1]][name] for name in header] == row
 
