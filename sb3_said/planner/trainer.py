@@ -202,11 +202,25 @@ class PlannerTrainer:
             older=None if older is None else older.to(self.device),
         ):
             return False
-        guess.requires_grad_(False)
+        self._settle_first_guess()
+        return True
+
+    def take_first_guess(self, other: PlannerTrainer) -> None:
+        """Take over what makes another planner's first guess, which has learned from the same data."""
+        guess, others = self.online.first_guess, other.online.first_guess
+        if guess is None or others is None or self.n_updates > 0:
+            return
+        self.older = None
+        guess.load_state_dict(others.state_dict())
+        self._settle_first_guess()
+
+    def _settle_first_guess(self) -> None:
+        """Learn how far the guess is right, and let nothing change it any more."""
+        assert self.online.first_guess is not None  # it was just made
+        self.online.first_guess.requires_grad_(False)
         self.online.fit_prior(self.source.sample(N_PRIOR_WINDOWS, self.online.window_length, self.generator))
         self.average.load_state_dict(self.online.state_dict())
         self._has_guessed = True
-        return True
 
     def _descend(self) -> tuple[th.Tensor]:
         """Draw a batch, move both sets of weights, and return both losses, (2,), without waiting for the device."""

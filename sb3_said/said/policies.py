@@ -85,11 +85,20 @@ class SAIDPolicy(DelayedSACPolicy):
 
     def make_planner(self, config: PlannerConfig) -> None:
         """Take a new, untrained planner of these settings."""
-        state_space, action_space, max_delay = check_spaces(self.observation_space, self.action_space)
-        sizes = state_space.shape[0], action_space.shape[0], max_delay
-        self.planner = InpaintingPlanner(*sizes, self._scored(config)).to(self.device).requires_grad_(False)
+        self.planner = self.new_planner(config)
         self.planner_updates.zero_()
         self.expert_preferred.zero_()
+
+    def take_planner(self, planner: InpaintingPlanner, config: PlannerConfig) -> None:
+        """Let a trained planner decide from now on, in the way that these settings of it say."""
+        planner.config = config
+        self.planner = planner
+
+    def new_planner(self, config: PlannerConfig) -> InpaintingPlanner:
+        """Return an untrained planner of these settings, for this policy's spaces."""
+        state_space, action_space, max_delay = check_spaces(self.observation_space, self.action_space)
+        sizes = state_space.shape[0], action_space.shape[0], max_delay
+        return InpaintingPlanner(*sizes, self._scored(config)).to(self.device).requires_grad_(False)
 
     def set_value(self, value: Value) -> None:
         """Value planned states by the expert's critics, or by a new, untrained V(s).

@@ -20,6 +20,7 @@ from sb3_said.delays.space import ages_of, has_state_history
 from sb3_said.files.archive import PathOrFile
 from sb3_said.offline import IQL, ImplicitValues, IQLConfig, OfflineAlgorithm, load_dataset
 from sb3_said.offline.learning import listed
+from sb3_said.planner import InpaintingPlanner
 from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.planner.values import returns_to_go
@@ -29,7 +30,7 @@ from sb3_said.said.callbacks import PlannerTrainingCallback
 from sb3_said.said.policies import Answer, SAIDPolicy, Value
 from sb3_said.said.student import Distillation, distill
 from sb3_said.said.training import PlannerTraining
-from sb3_said.said.trial import check_scored, let_the_best_answer, ways_of
+from sb3_said.said.trial import check_scored, in_way, let_the_best_answer, masks_of, ways_of
 
 HELD_OUT = 0.05  # of the planner's data
 HAND_OVER_INTERVAL = 100  # updates of an offline training
@@ -60,8 +61,10 @@ class SAID(OfflineAlgorithm, StableSAC):
     :param planner_trial_episodes: of the training environment, played after the planner's training in each of its ways
         to decide, and as many with the expert; the best one answers. They come on top of ``learn``'s steps. 0: the
         planner answers, as ``planner_kwargs`` says
-    :param planner_ways: names and settings of :meth:`set_planner` to compare with those of ``planner_kwargs``; by
-        default :data:`~sb3_said.said.trial.WAYS`, or none where ``planner_kwargs`` has such settings
+    :param planner_ways: names and settings of :meth:`set_planner` to compare with those of ``planner_kwargs``, or a
+        ``mask``, for which a second planner is trained; by default :data:`~sb3_said.said.trial.WAYS`, or none where
+        ``planner_kwargs`` has settings of ``set_planner``. A planner of ``mask="own"`` is left out where not every age
+        was trained on
     :param value: who scores the planner's candidates: ``"critics"``, the expert's, by min Q(s, a); or ``"iql"``, a
         V(s) that is learned beside the planner by implicit Q-learning, which is what offline learning has
     :param iql_kwargs: fields of :class:`~sb3_said.offline.IQLConfig`, how that V(s) is learned, such as
@@ -290,10 +293,13 @@ class SAID(OfflineAlgorithm, StableSAC):
         """
         self.policy.warmup(batch_size)
 
-    def make_planner_trainer(self, gradient_steps: int | None = None) -> PlannerTrainer:
+    def make_planner_trainer(
+        self, gradient_steps: int | None = None, planner: InpaintingPlanner | None = None
+    ) -> PlannerTrainer:
         """Return a trainer of this agent's planner on its replay buffer.
 
         :param gradient_steps: ``planner_gradient_steps`` by default
+        :param planner: in place of the agent's own, one of the same sizes
         :raises ValueError: when the buffer is empty, as it is after ``load``
         """
         steps = self.planner_gradient_steps if gradient_steps is None else _count("gradient_steps", gradient_steps)
@@ -303,7 +309,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         bootstrap = self._stored_values if self.has_expert else None  # offline there are no critics
         values = returns_to_go(source, self.gamma, self.planner_terminal_penalty, bootstrap)
         return PlannerTrainer(
-            self.policy.planner,
+            planner or self.policy.planner,
             replace(source, values=values),
             steps,
             held_out=HELD_OUT if len(source) > 1 else 0.0,
@@ -342,6 +348,9 @@ class SAID(OfflineAlgorithm, StableSAC):
     ) -> None:
         """Train the planner anew on the replay buffer, without running the expert; then see who answers better.
 
+        Where a trial follows, each other ``mask`` that ``planner_ways`` names has a planner too, of as many updates.
+        The agent keeps the one that does best.
+
         Interrupting (Ctrl-C) ends the training early and keeps the planner as far as it got. Until the training ends,
         and where it fails, the planner answers as before. Without ``verbose`` and a bar, one line says that it begins.
 
@@ -371,33 +380,55 @@ class SAID(OfflineAlgorithm, StableSAC):
         if not hasattr(self, "_logger"):  # not set_logger: learn() makes its own
             self._logger = configure_logger(self.verbose, self.tensorboard_log, "SAID", reset_num_timesteps=False)
 
-        def row(n_updates: int) -> int:
-            return self.num_timesteps + (n_updates if self.planner_train_freq is None else 0)
+        n_episodes = self.planner_trial_episodes if trial_episodes is None else trial_episodes
+        is_tried = n_episodes > 0 and self._can_be_tried()
 
-        trainer, intervals = self.make_planner_trainer(gradient_steps), (log_interval, eval_interval, save_interval)
-        training = PlannerTraining(self, trainer, self._make_value_trainer(), row, folder, *intervals)
-        if trainer.n_updates < trainer.gradient_steps and not progress_bar and self.verbose == 0:
-            print(
-                f"Training the planner: {trainer.gradient_steps} updates. progress_bar=True or verbose=1 shows how far "
-                "it is.",
-                flush=True,
-            )
-        outcome = training.run(progress_bar, should_stop)
-        if trainer.n_updates > 0:
+        def train(planner: InpaintingPlanner, *before: PlannerTrainer) -> tuple[PlannerTraining, str]:
+            def row(n_updates: int) -> int:
+                n_before = sum(trainer.n_updates for trainer in before)
+                return self.num_timesteps + (n_before + n_updates if self.planner_train_freq is None else 0)
+
+            trainer, intervals = self.make_planner_trainer(gradient_steps, planner), (log_interval, eval_interval)
+            values = None if before else self._make_value_trainer()
+            training = PlannerTraining(self, trainer, values, row, folder, *intervals, save_interval)
+            if before:
+                trainer.take_first_guess(before[0])  # of the same data
+            if trainer.n_updates < trainer.gradient_steps and not progress_bar and self.verbose == 0:
+                print(
+                    f"Training the {training.name}: {trainer.gradient_steps} updates. progress_bar=True or verbose=1 "
+                    "shows how far it is.",
+                    flush=True,
+                )
+            return training, training.run(progress_bar, should_stop)
+
+        training, outcome = train(self.policy.planner)
+        if training.trainer.n_updates > 0:
             self.set_answer("planner")
-            n_episodes = self.planner_trial_episodes if trial_episodes is None else trial_episodes
-            if outcome == "done" and n_episodes > 0 and self.env is not None and self.has_expert:
-                if self.replay_buffer.dones[: self.replay_buffer.size()].any():
-                    training.log(let_the_best_answer(self, n_episodes, progress_bar, should_stop))
-                else:
-                    warnings.warn(
-                        "No episode has ended in what the agent has stored, so a trial might never end: the planner "
-                        "answers as it is. train_planner() plays one later; set_answer() and set_planner() choose.",
-                        stacklevel=2,
-                    )
+        trainers = [training.trainer]
+        for mask in masks_of(self)[1:] if is_tried else []:
+            if outcome == "done":
+                planner = self.policy.new_planner(in_way(self.policy.planner.config, {"mask": mask}))
+                training, outcome = train(planner, *trainers)
+                trainers.append(training.trainer)
+        if is_tried and outcome == "done":
+            others = [trainer.planner for trainer in trainers[1:]]
+            training.log(let_the_best_answer(self, n_episodes, progress_bar, should_stop, others))
         if outcome == "stopped":
             raise KeyboardInterrupt
         self._planner_trained_at = self.num_timesteps
+
+    def _can_be_tried(self) -> bool:
+        """Tell whether planner and expert can be played. Warn where episodes might never end."""
+        if self.env is None or not self.has_expert:
+            return False
+        if self.replay_buffer.dones[: self.replay_buffer.size()].any():
+            return True
+        warnings.warn(
+            "No episode has ended in what the agent has stored, so a trial might never end: the planner answers as it "
+            "is. train_planner() plays one later; set_answer() and set_planner() choose.",
+            stacklevel=3,
+        )
+        return False
 
     def _make_value_trainer(self) -> IQL | None:
         """Return a trainer of V(s) on the replay buffer, where that is who values plans."""

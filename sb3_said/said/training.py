@@ -19,6 +19,7 @@ from sb3_said.planner.checks import check_same
 from sb3_said.planner.trainer import PlannerTrainer, worse_than_regression
 
 PLANNER_CHECKPOINT_NAME = "planner_checkpoint.zip"
+SECOND_CHECKPOINT_NAME = "planner_{mask}_checkpoint.zip"  # of a planner beside the agent's own
 
 SAID = Any  # whose module imports this one
 
@@ -49,7 +50,11 @@ class PlannerTraining:
     ):
         self.model, self.trainer, self.value_trainer, self.row = model, trainer, value_trainer, row
         self.log_interval, self.eval_interval, self.save_interval = log_interval, eval_interval, save_interval
-        self._clock = None if folder is None else CheckpointClock(Path(folder) / PLANNER_CHECKPOINT_NAME)
+        self.is_agents = trainer.planner is model.policy.planner  # or one beside it, for a trial
+        mask = trainer.config.mask
+        self.name = "planner" if self.is_agents else f"planner of mask={mask!r}"
+        file = PLANNER_CHECKPOINT_NAME if self.is_agents else SECOND_CHECKPOINT_NAME.format(mask=mask)
+        self._clock = None if folder is None else CheckpointClock(Path(folder) / file)
         self.watcher = watcher
         self._data = {"num_timesteps": model.num_timesteps, "replay": checksum(model)}
         self._weighed = {name: getattr(model, name) for name in ("gamma", "planner_terminal_penalty", "value")}
@@ -100,24 +105,25 @@ class PlannerTraining:
 
         try:
             if trainer.make_first_guess(progress_bar, should_stop):
-                with tqdm(total=total, initial=trainer.n_updates, desc="planner", disable=not progress_bar) as bar:
+                with tqdm(total=total, initial=trainer.n_updates, desc=self.name, disable=not progress_bar) as bar:
                     trainer.train(callback=on_update)
             else:
                 outcome = "stopped"
         except KeyboardInterrupt:
             outcome = "interrupted"
             result = "keeps what it learned" if trainer.n_updates > 0 else "stays as it was"
-            print(f"Planner training interrupted after {trainer.n_updates} of {total} updates; it {result}.")
+            result = result if self.is_agents else "is left out, and no trial is played"
+            print(f"Training of the {self.name} interrupted after {trainer.n_updates} of {total} updates; it {result}.")
         self.hand_over()
         return outcome
 
     def hand_over(self) -> None:
-        """Give the agent the planner and the values as far as they got; before the first update, leave it as it is.
+        """Give the planner its weights and the agent the values as far as they got; before the first update, none.
 
-        :raises FloatingPointError: when an update was not finite; the agent stays as it was
+        :raises FloatingPointError: when an update was not finite; all stays as it was
         """
         self.trainer.hand_over()
-        if self.trainer.n_updates > 0:
+        if self.trainer.n_updates > 0 and self.is_agents:
             self.model.policy.planner_updates.fill_(float(self.trainer.n_updates))
             if self.value_trainer is not None:
                 self.model.policy.values.load_state_dict(self.value_trainer.values.state_dict())

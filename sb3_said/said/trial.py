@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -11,6 +11,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 from tqdm.auto import tqdm
 
+from sb3_said.planner import InpaintingPlanner
 from sb3_said.planner.config import SAMPLING_SETTINGS, PlannerConfig
 from sb3_said.sac.policies import settings_of
 
@@ -23,7 +24,9 @@ NAME_LENGTH = 25  # of a way; SB3's log takes longer ones that begin alike for t
 #: actor on the present that the planner's first guess has; the default's steps; a single step; and the default's steps
 #: where the present is inpainted with the plan, for a guess may go wrong at old observations. Which is best
 #: depends on task, delay and budget (measured, results/what_diffusion_buys.md and results/settings.md). Where the trial
-#: cannot tell, the order does: the first was best or second with each of seven planners.
+#: cannot tell, the order does: the first was best or second with each of seven planners. "own_ages" is another planner,
+#: of decisions made at the age that it is shown: where an expert does one thing on new observations and another on old
+#: ones, the first learns the mean of both (results/what_diffusion_buys.md has where that gains, and where it loses).
 WAYS: dict[str, dict[str, Any]] = {
     "weighed": {"decided_by": "plan", "temperature": 1.0, "sampling_steps": 2, "choice_factor": 1.0},
     "actor": {"decided_by": "actor"},
@@ -35,7 +38,15 @@ WAYS: dict[str, dict[str, Any]] = {
         "sampling_steps": PlannerConfig.sampling_steps,
         "present": "inpainted",
     },
+    "own_ages": {
+        "mask": "own",
+        "decided_by": "plan",
+        "temperature": 0.0,
+        "sampling_steps": PlannerConfig.sampling_steps,
+        "present": "inpainted",
+    },
 }
+WAY_SETTINGS = (*SAMPLING_SETTINGS, "mask")
 
 
 @dataclass(frozen=True)
@@ -58,23 +69,31 @@ def ways_of(
     """Return the ways to compare: those given, or ``WAYS``; none where ``planner_kwargs`` says how to decide.
 
     :param value: who scores candidates, as of :class:`~sb3_said.said.SAID`
-    :raises ValueError: for other settings than those of ``set_planner``, and for values outside their range, or that
-        this planner cannot have
+    :raises ValueError: for other settings than ``mask`` and those of ``set_planner``, and for values outside their
+        range, or that this planner cannot have
     """
     own = settings_of(PlannerConfig, planner_kwargs, "The planner")
     if given is None:
         if set(SAMPLING_SETTINGS) & set(planner_kwargs):
             return {}
         guesses = own.present == "guessed"
-        is_another = {"actor": guesses, "inpainted": guesses and own.mask != "none"}
-        return {name: way for name, way in WAYS.items() if is_another.get(name, True)}
+        is_another = {
+            "actor": guesses,
+            "inpainted": guesses and own.mask != "none",
+            "own_ages": own.mask == "random",
+        }
+        ways = {name: way for name, way in WAYS.items() if is_another.get(name, True)}
+        if "own_ages" not in ways:
+            return ways
+        first = {"mask": own.mask, "present": own.present}  # also where the agent has the second's, later
+        return {name: {**first, **way} for name, way in ways.items()}
     for name, settings in given.items():
         if len(name) > NAME_LENGTH:
             raise ValueError(f"planner_ways has the name {name!r}; expected at most {NAME_LENGTH} letters.")
-        if name in ("planner", "expert") or not set(settings) <= set(SAMPLING_SETTINGS):
+        if name in ("planner", "expert") or not set(settings) <= set(WAY_SETTINGS):
             raise ValueError(
                 f"planner_ways has {name!r}: {settings}; expected another name than 'planner' and 'expert', with "
-                f"settings from {', '.join(SAMPLING_SETTINGS)}."
+                f"settings from {', '.join(WAY_SETTINGS)}."
             )
         in_way(own, settings)
         check_scored(settings, value == "iql")
@@ -99,6 +118,19 @@ def _configs(model: SAID) -> dict[str, PlannerConfig]:
     return {name: in_way(model.policy.planner.config, settings) for name, settings in model.planner_ways.items()}
 
 
+def masks_of(model: SAID) -> list[str]:
+    """Return the masks that the agent's ways to decide need a planner of, its planner's own first.
+
+    Where not every age of 0..D was trained on, or none is known, as of logs, there are no decisions of each age to
+    learn from: a planner of ``mask="own"`` would serve some delays alone.
+    """
+    own = model.policy.planner.config.mask
+    n_ages = model.policy.max_delay + 1
+    knows_ages = 1 < n_ages == len(set(model.trained_ages or []) & set(range(n_ages)))
+    others = {config.mask for config in _configs(model).values()} - {own} - (set() if knows_ages else {"own"})
+    return [own, *sorted(others)]
+
+
 def check_scored(settings: dict[str, Any], is_by_state: bool) -> None:
     """Refuse ways to score candidates in which V(s) would see no difference.
 
@@ -114,7 +146,11 @@ def check_scored(settings: dict[str, Any], is_by_state: bool) -> None:
 
 
 def play_trial(
-    model: SAID, n_episodes: int, progress_bar: bool = False, should_stop: Callable[[], bool] | None = None
+    model: SAID,
+    n_episodes: int,
+    progress_bar: bool = False,
+    should_stop: Callable[[], bool] | None = None,
+    planners: Sequence[InpaintingPlanner] = (),
 ) -> Trial:
     """Play the training environment with the planner, in each of its ways, and with the expert, from the same seeds.
 
@@ -125,25 +161,29 @@ def play_trial(
     :param n_episodes: for each
     :param progress_bar: show one
     :param should_stop: asked after every step
+    :param planners: other trained planners, which ways of their masks play; ways whose mask none has are left out
     :raises KeyboardInterrupt: when ``should_stop`` has ended the trial
     """
-    seed, own = int(np.random.randint(2**31)), model.policy.planner.config
-    named = {"planner" if way == own else name: way for name, way in _configs(model).items()} | {"planner": own}
+    policy = model.policy
+    seed, planner, own = int(np.random.randint(2**31)), policy.planner, policy.planner.config
+    by_mask = {other.config.mask: other for other in (*planners, planner)}
+    configs = {name: way for name, way in _configs(model).items() if way.mask in by_mask}
+    named = {"planner" if way == own else name: way for name, way in configs.items()} | {"planner": own}
     can_act = model.has_expert and 0 in (model.trained_ages or [])
-    can_act &= model.policy.max_delay > 0  # without delay the actor is the expert
+    can_act &= policy.max_delay > 0  # without delay the actor is the expert
     ways = {name: way for name, way in named.items() if name == "planner" or way.decided_by == "plan" or can_act}
     returns, ages, n_steps = {}, {}, 0
     try:
         with model.borrowed_env() as env:
             for name, config in {**ways, "expert": own}.items():
-                model.policy.planner.config = config
+                policy.take_planner(by_mask[config.mask], config)
                 who = "expert" if name == "expert" else "planner"
                 bar = tqdm(total=n_episodes, desc=name, disable=not progress_bar)
-                with bar, model.policy.answering(who, at_once=True):
+                with bar, policy.answering(who, at_once=True):
                     returns[name], ages[name], n_played = _play(model, env, n_episodes, seed, bar, should_stop)
                 n_steps += n_played
     finally:
-        model.policy.planner.config = own
+        policy.take_planner(planner, own)
     oldest = np.max(list(ages.values()), axis=0)  # whoever falls at once meets young observations alone
     return Trial(returns, np.zeros(n_episodes) if np.isnan(oldest).any() else oldest, n_steps)
 
@@ -208,17 +248,22 @@ def gains_more_than_its_error(returns: np.ndarray, than: np.ndarray) -> bool:
 
 
 def let_the_best_answer(
-    model: SAID, n_episodes: int, progress_bar: bool = False, should_stop: Callable[[], bool] | None = None
+    model: SAID,
+    n_episodes: int,
+    progress_bar: bool = False,
+    should_stop: Callable[[], bool] | None = None,
+    planners: Sequence[InpaintingPlanner] = (),
 ) -> dict[str, float]:
     """Let the planner in its best way answer, or the expert, or both, each at the ages at which it does better.
 
     If the best way gains no more than its error over some, the first of these in ``planner_ways`` is taken. Both answer
     only if that :func:`gains_more_than_its_error` over the better of the two. Warn where the expert alone answers.
 
+    :param planners: beside the agent's own, as of :func:`play_trial`; the agent takes the one of the best way
     :return: mean returns, the expert's ages, and the number of steps played, for the log
     """
     own, configs = model.policy.planner.config, _configs(model)
-    trial = play_trial(model, n_episodes, progress_bar, should_stop)
+    trial = play_trial(model, n_episodes, progress_bar, should_stop, planners)
     expert = trial.returns["expert"]
     ways = [name for name in trial.returns if name != "expert"]
     shares = {name: best_share(trial.returns[name], expert, trial.ages) for name in ways}
@@ -230,7 +275,9 @@ def let_the_best_answer(
         best = trial.returns[max(ways, key=lambda name: trial.returns[name].mean())]
         way = next(name for name in ways if not gains_more_than_its_error(best, trial.returns[name]))
         cut, is_below = (np.inf if alone == "expert" else -1.0), True
-    model.policy.planner.config = configs.get(way, own)
+    config = configs.get(way, own)
+    by_mask = {planner.config.mask: planner for planner in (*planners, model.policy.planner)}
+    model.policy.take_planner(by_mask[config.mask], config)
     if 0 <= cut < model.policy.max_delay:
         model.set_answer("both", **({"expert_up_to": int(cut)} if is_below else {"expert_from": int(cut) + 1}))
     else:

@@ -95,8 +95,8 @@ def test_a_killed_training_goes_on_bit_for_bit(run, tmp_path, monkeypatch):
     monkeypatch.setattr(SAID, "train_planner", functools.partialmethod(SAID.train_planner, save_interval=2))
     make_trainer, calls = SAID.make_planner_trainer, []
 
-    def stopping(self, gradient_steps=None):
-        trainer = make_trainer(self, gradient_steps)
+    def stopping(self, *args):
+        trainer = make_trainer(self, *args)
         step = trainer.step
 
         def one_step():
