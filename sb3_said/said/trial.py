@@ -131,6 +131,12 @@ def masks_of(model: SAID) -> list[str]:
     return [own, *sorted(others)]
 
 
+def _players(model: SAID, planners: Sequence[InpaintingPlanner]) -> dict[str, tuple[InpaintingPlanner, PlannerConfig]]:
+    """Return who decides in each of the agent's ways that one of these planners, or its own, can play, and how."""
+    by_mask = {planner.config.mask: planner for planner in (*planners, model.policy.planner)}
+    return {name: (by_mask[way.mask], way) for name, way in _configs(model).items() if way.mask in by_mask}
+
+
 def check_scored(settings: dict[str, Any], is_by_state: bool) -> None:
     """Refuse ways to score candidates in which V(s) would see no difference.
 
@@ -164,26 +170,25 @@ def play_trial(
     :param planners: other trained planners, which ways of their masks play; ways whose mask none has are left out
     :raises KeyboardInterrupt: when ``should_stop`` has ended the trial
     """
-    policy = model.policy
-    seed, planner, own = int(np.random.randint(2**31)), policy.planner, policy.planner.config
-    by_mask = {other.config.mask: other for other in (*planners, planner)}
-    configs = {name: way for name, way in _configs(model).items() if way.mask in by_mask}
-    named = {"planner" if way == own else name: way for name, way in configs.items()} | {"planner": own}
+    policy, seed = model.policy, int(np.random.randint(2**31))
+    own = policy.planner, policy.planner.config
+    players = _players(model, planners)
+    named = {"planner" if player == own else name: player for name, player in players.items()} | {"planner": own}
     can_act = model.has_expert and 0 in (model.trained_ages or [])
     can_act &= policy.max_delay > 0  # without delay the actor is the expert
-    ways = {name: way for name, way in named.items() if name == "planner" or way.decided_by == "plan" or can_act}
+    ways = {name: how for name, how in named.items() if name == "planner" or how[1].decided_by == "plan" or can_act}
     returns, ages, n_steps = {}, {}, 0
     try:
         with model.borrowed_env() as env:
-            for name, config in {**ways, "expert": own}.items():
-                policy.take_planner(by_mask[config.mask], config)
+            for name, how in {**ways, "expert": own}.items():
+                policy.take_planner(*how)
                 who = "expert" if name == "expert" else "planner"
                 bar = tqdm(total=n_episodes, desc=name, disable=not progress_bar)
                 with bar, policy.answering(who, at_once=True):
                     returns[name], ages[name], n_played = _play(model, env, n_episodes, seed, bar, should_stop)
                 n_steps += n_played
     finally:
-        policy.take_planner(planner, own)
+        policy.take_planner(*own)
     oldest = np.max(list(ages.values()), axis=0)  # whoever falls at once meets young observations alone
     return Trial(returns, np.zeros(n_episodes) if np.isnan(oldest).any() else oldest, n_steps)
 
@@ -262,7 +267,7 @@ def let_the_best_answer(
     :param planners: beside the agent's own, as of :func:`play_trial`; the agent takes the one of the best way
     :return: mean returns, the expert's ages, and the number of steps played, for the log
     """
-    own, configs = model.policy.planner.config, _configs(model)
+    own, players = (model.policy.planner, model.policy.planner.config), _players(model, planners)
     trial = play_trial(model, n_episodes, progress_bar, should_stop, planners)
     expert = trial.returns["expert"]
     ways = [name for name in trial.returns if name != "expert"]
@@ -275,9 +280,7 @@ def let_the_best_answer(
         best = trial.returns[max(ways, key=lambda name: trial.returns[name].mean())]
         way = next(name for name in ways if not gains_more_than_its_error(best, trial.returns[name]))
         cut, is_below = (np.inf if alone == "expert" else -1.0), True
-    config = configs.get(way, own)
-    by_mask = {planner.config.mask: planner for planner in (*planners, model.policy.planner)}
-    model.policy.take_planner(by_mask[config.mask], config)
+    model.policy.take_planner(*players.get(way, own))
     if 0 <= cut < model.policy.max_delay:
         model.set_answer("both", **({"expert_up_to": int(cut)} if is_below else {"expert_from": int(cut) + 1}))
     else:
