@@ -58,9 +58,9 @@ class SAID(OfflineAlgorithm, StableSAC):
     :param planner_terminal_penalty: replaces the reward of a terminating step in the values that weigh windows. The
         paper's Table 3 has -100, for tasks that end by falling, and the presets of such tasks have it too; None keeps
         the reward, for tasks that may end because they are done
-    :param planner_trial_episodes: of the training environment, played after the planner's training in each of its ways
-        to decide, and as many with the expert; the best one answers. They come on top of ``learn``'s steps. 0: the
-        planner answers, as ``planner_kwargs`` says
+    :param planner_trial_episodes: of the training environment, played after the planner's training, a quarter of them
+        in each of its ways to decide, the others in the three best, and all with the expert; the best one answers. They
+        come on top of ``learn``'s steps. 0: the planner answers, as ``planner_kwargs`` says
     :param planner_ways: names and settings of :meth:`set_planner` to compare with those of ``planner_kwargs``, or a
         ``mask``, for which a second planner is trained; by default :data:`~sb3_said.said.trial.WAYS`, or none where
         ``planner_kwargs`` has settings of ``set_planner``. A planner of ``mask="own"`` is left out where not every age
@@ -93,7 +93,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         planner_train_freq: int | None = None,
         planner_newest_fraction: float = 0.2,
         planner_terminal_penalty: float | None = None,
-        planner_trial_episodes: int = 10,
+        planner_trial_episodes: int = 20,
         planner_ways: dict[str, dict[str, Any]] | None = None,
         value: Value = "critics",
         iql_kwargs: dict[str, Any] | None = None,

@@ -18,6 +18,8 @@ from sb3_said.sac.policies import settings_of
 SAID = Any  # whose module imports this one
 
 CUT_AT = 10  # times the longest stored episode: a good answer may never end one
+FIRST_PART = 0.25  # of a trial's episodes, which all ways play
+GO_ON = 3  # ways that play the others, too (simulated with episodes of 30 planners, results/settings.md)
 NAME_LENGTH = 25  # of a way; SB3's log takes longer ones that begin alike for the same
 
 #: What a trial compares with an agent's own settings: the mean of all candidates, weighed by the critics; the expert's
@@ -55,7 +57,7 @@ class Trial:
 
     returns: dict[str, np.ndarray]
     """(n_episodes,) of each of ``planner_ways``, in their order; of "planner", in the place of the way that is its own
-    or behind them; and of "expert". Undiscounted, in the task's own rewards"""
+    or behind them; and of "expert". Undiscounted, in the task's own rewards. Fewer of ways that were given up"""
     ages: np.ndarray
     """(n_episodes,) age of the observations of each, amid the episode, in control steps; 0 for all where it changes
     within episodes, which then differ in it from player to player"""
@@ -160,11 +162,14 @@ def play_trial(
 ) -> Trial:
     """Play the training environment with the planner, in each of its ways, and with the expert, from the same seeds.
 
+    All of them play the first quarter of the episodes. Then the three best ways, each with the expert at the ages at
+    which that does better, and the expert play on.
+
     These are environment steps beyond those of ``learn``. An expert that has not learned at age 0, as one of a fixed
     delay, does not try to act on a guessed present.
 
     :param model: with a trained planner and an environment; stays as it is
-    :param n_episodes: for each
+    :param n_episodes: for each that plays to the end
     :param progress_bar: show one
     :param should_stop: asked after every step
     :param planners: other trained planners, which ways of their masks play; ways whose mask none has are left out
@@ -177,20 +182,39 @@ def play_trial(
     can_act = model.has_expert and 0 in (model.trained_ages or [])
     can_act &= policy.max_delay > 0  # without delay the actor is the expert
     ways = {name: how for name, how in named.items() if name == "planner" or how[1].decided_by == "plan" or can_act}
-    returns, ages, n_steps = {}, {}, 0
+    everyone = {**ways, "expert": own}
+    returns: dict[str, np.ndarray] = {name: np.zeros(0) for name in everyone}
+    ages, n_steps = np.zeros(0), 0
+
+    def play_on(env: VecEnv, names: list[str], n: int) -> None:
+        nonlocal ages, n_steps
+        first, met = len(ages), []
+        for name in names:
+            policy.take_planner(*everyone[name])
+            bar = tqdm(total=n, desc=name, disable=not progress_bar)
+            with bar, policy.answering("expert" if name == "expert" else "planner", at_once=True):
+                found, met_ages, n_played = _play(model, env, n, seed + first, bar, should_stop)
+            returns[name] = np.append(returns[name], found)
+            met.append(met_ages)
+            n_steps += n_played
+        ages = np.append(ages, np.max(met, axis=0))  # whoever falls at once meets young observations alone
+
     try:
         with model.borrowed_env() as env:
-            for name, how in {**ways, "expert": own}.items():
-                policy.take_planner(*how)
-                who = "expert" if name == "expert" else "planner"
-                bar = tqdm(total=n_episodes, desc=name, disable=not progress_bar)
-                with bar, policy.answering(who, at_once=True):
-                    returns[name], ages[name], n_played = _play(model, env, n_episodes, seed, bar, should_stop)
-                n_steps += n_played
+            n_first = n_episodes if len(ways) <= GO_ON else int(np.ceil(FIRST_PART * n_episodes))
+            play_on(env, [*everyone], n_first)
+            if n_first < n_episodes:
+                shares = {name: best_share(returns[name], returns["expert"], _if_settled(ages))[0] for name in ways}
+                best = sorted(ways, key=lambda name: -shares[name])[:GO_ON]  # of equal ones, the first
+                play_on(env, [name for name in everyone if name in (*best, "expert")], n_episodes - n_first)
     finally:
         policy.take_planner(*own)
-    oldest = np.max(list(ages.values()), axis=0)  # whoever falls at once meets young observations alone
-    return Trial(returns, np.zeros(n_episodes) if np.isnan(oldest).any() else oldest, n_steps)
+    return Trial(returns, _if_settled(ages), n_steps)
+
+
+def _if_settled(ages: np.ndarray) -> np.ndarray:
+    """Return episodes' ages, or 0 for all where one changed within an episode, which is NaN here."""
+    return np.zeros(len(ages)) if np.isnan(ages).any() else ages
 
 
 def _play(
@@ -270,15 +294,16 @@ def let_the_best_answer(
     own, players = (model.policy.planner, model.policy.planner.config), _players(model, planners)
     trial = play_trial(model, n_episodes, progress_bar, should_stop, planners)
     expert = trial.returns["expert"]
-    ways = [name for name in trial.returns if name != "expert"]
-    shares = {name: best_share(trial.returns[name], expert, trial.ages) for name in ways}
-    alone = max(trial.returns, key=lambda name: trial.returns[name].mean())
+    played = {name: returns for name, returns in trial.returns.items() if len(returns) == len(expert)}
+    ways = [name for name in played if name != "expert"]
+    shares = {name: best_share(played[name], expert, trial.ages) for name in ways}
+    alone = max(played, key=lambda name: played[name].mean())
     way = max(ways, key=lambda name: shares[name][0])
     _, cut, is_below = shares[way]
-    together = np.where((trial.ages <= cut) == is_below, expert, trial.returns[way])
-    if not gains_more_than_its_error(together, trial.returns[alone]):
-        best = trial.returns[max(ways, key=lambda name: trial.returns[name].mean())]
-        way = next(name for name in ways if not gains_more_than_its_error(best, trial.returns[name]))
+    together = np.where((trial.ages <= cut) == is_below, expert, played[way])
+    if not gains_more_than_its_error(together, played[alone]):
+        best = played[max(ways, key=lambda name: played[name].mean())]
+        way = next(name for name in ways if not gains_more_than_its_error(best, played[name]))
         cut, is_below = (np.inf if alone == "expert" else -1.0), True
     model.policy.take_planner(*players.get(way, own))
     if 0 <= cut < model.policy.max_delay:
@@ -287,7 +312,7 @@ def let_the_best_answer(
         model.set_answer("planner" if cut < 0 else "expert")
     if np.isinf(cut):
         warnings.warn(
-            f"The planner is worse than its expert: mean returns of {trial.returns[way].mean():.5g} and "
+            f"The planner is worse than its expert: mean returns of {played[way].mean():.5g} and "
             f"{expert.mean():.5g} over {n_episodes} episodes each. So the expert answers. More planner_gradient_steps "
             "or more data may mend the planner; set_answer('planner') lets it answer all the same.",
             stacklevel=3,

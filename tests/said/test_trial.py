@@ -41,7 +41,8 @@ def trained():
     return make(env=pendulum(delay=(0, 2)), planner_ways=OF_ONE_PLANNER).learn(60)
 
 
-def test_returns_are_those_of_each_who_can_answer(trained):
+def test_returns_are_those_of_each_who_can_answer(trained, monkeypatch):
+    monkeypatch.setattr(trial, "GO_ON", 6)  # all of them
     before = trained.policy.planner.config
     np.random.seed(3)
     found = trial.play_trial(trained, n_episodes=3)
@@ -62,6 +63,40 @@ def test_returns_are_those_of_each_who_can_answer(trained):
             assert found_return == pytest.approx(expected, rel=1e-5)
         trained.policy.planner.config = before
     assert len({returns[0] for returns in played.values()}) == 7
+
+
+def test_the_three_best_ways_and_the_expert_play_on(trained, monkeypatch):
+    """A way counts together with the expert, each at the age at which it does better; of equal ones the first."""
+    names = ["weighed", "actor", "default", "one_step", "inpainted", "planner", "expert"]
+    first = [[6.0, 6.0], [9.0, 0.0], [5.0, 5.5], [0.0, 9.0], [7.0, 7.0], [6.0, 5.9], [5.0, 9.0]]
+    shared = {"weighed": 7.5, "actor": 9.0, "default": 7.0, "one_step": 7.0, "inpainted": 8.0, "planner": 7.5}
+    assert [trial.best_share(*map(np.array, (way, first[-1], [0.0, 2.0])))[0] for way in first[:-1]] == [
+        *shared.values()
+    ]
+    parts, asked = iter([*first, *[[0.0] * 6] * 4]), []
+
+    def play(model, env, n_episodes, seed, *_):
+        asked.append((n_episodes, seed))
+        returns = np.array(next(parts))
+        return returns, np.resize([0.0, 2.0], len(returns)), len(returns)
+
+    monkeypatch.setattr(trial, "_play", play)
+    found = trial.play_trial(trained, 8)
+    assert [*found.returns] == names
+    assert [len(returns) for returns in found.returns.values()] == [8, 8, 2, 2, 8, 2, 8]
+    seed = asked[0][1]
+    assert asked == [(2, seed)] * 7 + [(6, seed + 2)] * 4
+    np.testing.assert_array_equal(found.ages, [0, 2] * 4)
+    assert found.n_steps == 7 * 2 + 4 * 6
+    np.testing.assert_array_equal(found.returns["actor"], [9, 0, *[0] * 6])
+
+
+def test_who_was_given_up_is_not_chosen(monkeypatch):
+    played = {"a": np.array([9.0]), "planner": np.array([1.0, 2.0]), "b": np.array([3.0, 4.0]), "expert": np.zeros(2)}
+    monkeypatch.setattr(trial, "play_trial", lambda *_: trial.Trial(played, np.full(2, 2.0), 7))
+    ways = {"a": {"sampling_steps": 1}, "b": {"sampling_steps": 4}}
+    model = make(planner_trial_episodes=2, planner_ways=ways).learn(60)
+    assert model.policy.who_answers == "planner" and model.policy.planner.config.sampling_steps == 4
 
 
 def test_an_expert_that_has_not_learned_without_delay_acts_on_no_guess():
