@@ -154,8 +154,8 @@ class PlannerTraining:
         is_end = self.trainer.n_updates == self.trainer.gradient_steps
         if is_end and (worse := worse_than_regression(errors)):
             warnings.warn(
-                f"On held-out windows the planner is still worse than a small regression: {worse}. It is undertrained; "
-                "give it more planner_gradient_steps, or more data.",
+                f"On held-out windows the {self.name} is still worse than a small regression: {worse}. It is "
+                "undertrained; give it more planner_gradient_steps, or more data.",
                 stacklevel=6,
             )
         return losses["planner/loss"]
