@@ -200,7 +200,8 @@ def learn_values(model: SAID, updates: int) -> None:
 
 def preset_of(model: SAID, args: argparse.Namespace) -> PlannerConfig:
     """Return the settings of SAID's row, whatever the run's trial chose."""
-    return replace(model.policy.planner.config, **WAYS["default"], **args.planner_kwargs)
+    way = model.planner_ways.get("default", WAYS["default"])  # of the first planner, where the trial took the second
+    return replace(model.policy.planner.config, **{**way, **args.planner_kwargs})
 
 
 def players(model: SAID, rows: list[str], args: argparse.Namespace) -> Iterator[tuple[str, int | None, Any]]:

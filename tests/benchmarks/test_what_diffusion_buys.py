@@ -2,6 +2,7 @@
 
 import copy
 import json
+from argparse import Namespace
 from dataclasses import replace
 
 import gymnasium as gym
@@ -169,3 +170,14 @@ def test_the_plain_network_reads_what_the_planner_reads(run):
     observation = {"observation": np.zeros((1, 4), np.float32), "action_history": np.zeros((1, 2, 1), np.float32)}
     answer, _ = regression.predict(observation | {"delay": np.ones((1, 1), np.float32)})
     assert answer.shape == (1, 1) and np.abs(answer).max() <= model.action_space.high.max()
+
+
+def test_the_preset_is_the_first_planners_whichever_the_trial_took():
+    env = DelayedObservationWrapper(gym.make(ENV), (0, 2))
+    model = SAID("MlpPolicy", env, planner_kwargs={"d_model": 32, "depth": 1}, buffer_size=500, device="cpu")
+    preset = model.policy.planner.config
+    second = replace(preset, mask="own", present="inpainted", sampling_steps=1)
+    model.policy.take_planner(model.policy.new_planner(second), second)
+    assert script.preset_of(model, Namespace(planner_kwargs={})) == preset
+    other = script.preset_of(model, Namespace(planner_kwargs={"present": "inpainted"}))
+    assert other == replace(preset, present="inpainted")
