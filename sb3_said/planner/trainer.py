@@ -205,9 +205,9 @@ class PlannerTrainer:
         self._settle_first_guess()
         return True
 
-    def take_first_guess(self, other: PlannerTrainer) -> None:
-        """Take over what makes another planner's first guess, which has learned from the same data."""
-        guess, others = self.online.first_guess, other.online.first_guess
+    def take_first_guess(self, other: InpaintingPlanner) -> None:
+        """Take over what makes a trained planner's first guess, which has learned from the same data."""
+        guess, others = self.online.first_guess, other.first_guess
         if guess is None or others is None or self.n_updates > 0:
             return
         self.older = None

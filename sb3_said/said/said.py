@@ -383,10 +383,10 @@ class SAID(OfflineAlgorithm, StableSAC):
         n_episodes = self.planner_trial_episodes if trial_episodes is None else trial_episodes
         is_tried = n_episodes > 0 and self._can_be_tried()
 
-        def train(planner: InpaintingPlanner, *before: PlannerTrainer) -> tuple[PlannerTraining, str]:
+        def train(planner: InpaintingPlanner, *before: InpaintingPlanner) -> tuple[PlannerTraining, str]:
             def row(n_updates: int) -> int:
-                n_before = sum(trainer.n_updates for trainer in before)
-                return self.num_timesteps + (n_before + n_updates if self.planner_train_freq is None else 0)
+                n_made = len(before) * trainer.gradient_steps + n_updates
+                return self.num_timesteps + (n_made if self.planner_train_freq is None else 0)
 
             trainer, intervals = self.make_planner_trainer(gradient_steps, planner), (log_interval, eval_interval)
             values = None if before else self._make_value_trainer()
@@ -404,15 +404,14 @@ class SAID(OfflineAlgorithm, StableSAC):
         training, outcome = train(self.policy.planner)
         if training.trainer.n_updates > 0:
             self.set_answer("planner")
-        trainers = [training.trainer]
+        planners = [self.policy.planner]
         for mask in masks_of(self)[1:] if is_tried else []:
             if outcome == "done":
                 planner = self.policy.new_planner(in_way(self.policy.planner.config, {"mask": mask}))
-                training, outcome = train(planner, *trainers)
-                trainers.append(training.trainer)
+                training, outcome = train(planner, *planners)
+                planners.append(planner)
         if is_tried and outcome == "done":
-            others = [trainer.planner for trainer in trainers[1:]]
-            training.log(let_the_best_answer(self, n_episodes, progress_bar, should_stop, others))
+            training.log(let_the_best_answer(self, n_episodes, progress_bar, should_stop, planners[1:]))
         if outcome == "stopped":
             raise KeyboardInterrupt
         self._planner_trained_at = self.num_timesteps

@@ -22,6 +22,11 @@ FIRST_PART = 0.25  # of a trial's episodes, which all ways play
 GO_ON = 3  # ways that play the others, too (simulated with episodes of 30 planners, results/settings.md)
 NAME_LENGTH = 25  # of a way; SB3's log takes longer ones that begin alike for the same
 
+DEFAULT_WAY: dict[str, Any] = {
+    "decided_by": "plan",
+    "temperature": 0.0,
+    "sampling_steps": PlannerConfig.sampling_steps,
+}
 #: What a trial compares with an agent's own settings: the mean of all candidates, weighed by the critics; the expert's
 #: actor on the present that the planner's first guess has; the default's steps; a single step; and the default's steps
 #: where the present is inpainted with the plan, for a guess may go wrong at old observations. Which is best
@@ -32,21 +37,10 @@ NAME_LENGTH = 25  # of a way; SB3's log takes longer ones that begin alike for t
 WAYS: dict[str, dict[str, Any]] = {
     "weighed": {"decided_by": "plan", "temperature": 1.0, "sampling_steps": 2, "choice_factor": 1.0},
     "actor": {"decided_by": "actor"},
-    "default": {"decided_by": "plan", "temperature": 0.0, "sampling_steps": PlannerConfig.sampling_steps},
-    "one_step": {"decided_by": "plan", "temperature": 0.0, "sampling_steps": 1},
-    "inpainted": {
-        "decided_by": "plan",
-        "temperature": 0.0,
-        "sampling_steps": PlannerConfig.sampling_steps,
-        "present": "inpainted",
-    },
-    "own_ages": {
-        "mask": "own",
-        "decided_by": "plan",
-        "temperature": 0.0,
-        "sampling_steps": PlannerConfig.sampling_steps,
-        "present": "inpainted",
-    },
+    "default": DEFAULT_WAY,
+    "one_step": {**DEFAULT_WAY, "sampling_steps": 1},
+    "inpainted": {**DEFAULT_WAY, "present": "inpainted"},
+    "own_ages": {**DEFAULT_WAY, "present": "inpainted", "mask": "own"},
 }
 WAY_SETTINGS = (*SAMPLING_SETTINGS, "mask")
 
@@ -126,9 +120,9 @@ def masks_of(model: SAID) -> list[str]:
     Where not every age of 0..D was trained on, or none is known, as of logs, there are no decisions of each age to
     learn from: a planner of ``mask="own"`` would serve some delays alone.
     """
-    own = model.policy.planner.config.mask
-    n_ages = model.policy.max_delay + 1
-    knows_ages = 1 < n_ages == len(set(model.trained_ages or []) & set(range(n_ages)))
+    own, max_delay = model.policy.planner.config.mask, model.policy.max_delay
+    knows_ages = max_delay > 0 and set(range(max_delay + 1)) <= set(model.trained_ages or [])
+    knows_ages &= not model.replay_buffer.holds_logs
     others = {config.mask for config in _configs(model).values()} - {own} - (set() if knows_ages else {"own"})
     return [own, *sorted(others)]
 

@@ -80,7 +80,7 @@ def test_the_agent_keeps_the_planner_that_does_best(monkeypatch, updates, tmp_pa
     # as by itself, of those settings, but for the first guess, which is the first planner's
     first, alone = (model.make_planner_trainer(planner=model.policy.new_planner(c)) for c in (config, second.config))
     first.make_first_guess()
-    alone.take_first_guess(first)
+    alone.take_first_guess(first.average)
     alone.train()
     assert same(weights(alone.planner), weights(second))
 
@@ -150,6 +150,14 @@ def test_by_default_there_are_two_and_one_of_a_fixed_delay_or_without_a_trial(up
         model.learn(60)
         assert updates == [mask for mask in masks for _ in range(3)]
     assert make(env=delayed(), planner_ways={}).learn(60).policy.planner.config.mask == "random"
+
+
+def test_logs_do_not_tell_at_which_age_their_decisions_were_made(updates):
+    model, other = make_two().learn(60), make_two(seed=1).learn(60)
+    model.take_dataset(other.replay_buffer)
+    updates.clear()
+    model.train_planner(trial_episodes=1)
+    assert updates == ["random"] * 5
 
 
 def test_trainings_amid_learning_are_of_the_first_alone(updates):
