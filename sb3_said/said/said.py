@@ -64,7 +64,7 @@ class SAID(OfflineAlgorithm, StableSAC):
     :param planner_ways: names and settings of :meth:`set_planner` to compare with those of ``planner_kwargs``, or a
         ``mask``, for which a second planner is trained; by default :data:`~sb3_said.said.trial.WAYS`, or none where
         ``planner_kwargs`` has settings of ``set_planner``. A planner of ``mask="own"`` is left out where not every age
-        was trained on
+        was trained on, and on logs
     :param value: who scores the planner's candidates: ``"critics"``, the expert's, by min Q(s, a); or ``"iql"``, a
         V(s) that is learned beside the planner by implicit Q-learning, which is what offline learning has
     :param iql_kwargs: fields of :class:`~sb3_said.offline.IQLConfig`, how that V(s) is learned, such as
