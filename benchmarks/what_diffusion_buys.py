@@ -59,7 +59,7 @@ from sb3_said.offline.belief import BeliefOnly, PlannerBelief
 from sb3_said.planner import InpaintingPlanner
 from sb3_said.planner.inpainting import newest
 from sb3_said.planner.trainer import PlannerTrainer
-from sb3_said.said.trial import WAYS
+from sb3_said.said.ways import WAYS
 
 EXPERT = ("expert, last", "expert, average")
 NETWORKS = ("cloning", "regressed present", "inpainted present", "guessed present", GUESS_ALONE)

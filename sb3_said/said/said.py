@@ -30,7 +30,8 @@ from sb3_said.said.callbacks import PlannerTrainingCallback
 from sb3_said.said.policies import Answer, SAIDPolicy, Value
 from sb3_said.said.student import Distillation, distill
 from sb3_said.said.training import PlannerTraining
-from sb3_said.said.trial import check_scored, in_way, let_the_best_answer, masks_of, ways_of
+from sb3_said.said.trial import let_the_best_answer
+from sb3_said.said.ways import check_scored, in_way, masks_of, ways_of
 
 HELD_OUT = 0.05  # of the planner's data
 HAND_OVER_INTERVAL = 100  # updates of an offline training
@@ -62,7 +63,7 @@ class SAID(OfflineAlgorithm, StableSAC):
         in each of its ways to decide, the others in the three best, and all with the expert; the best one answers. They
         come on top of ``learn``'s steps. 0: the planner answers, as ``planner_kwargs`` says
     :param planner_ways: names and settings of :meth:`set_planner` to compare with those of ``planner_kwargs``, or a
-        ``mask``, for which a second planner is trained; by default :data:`~sb3_said.said.trial.WAYS`, or none where
+        ``mask``, for which a second planner is trained; by default :data:`~sb3_said.said.ways.WAYS`, or none where
         ``planner_kwargs`` has settings of ``set_planner``. A planner of ``mask="own"`` is left out where not every age
         was trained on, and on logs
     :param value: who scores the planner's candidates: ``"critics"``, the expert's, by min Q(s, a); or ``"iql"``, a

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
@@ -12,37 +12,13 @@ from stable_baselines3.common.vec_env import VecEnv
 from tqdm.auto import tqdm
 
 from sb3_said.planner import InpaintingPlanner
-from sb3_said.planner.config import SAMPLING_SETTINGS, PlannerConfig
-from sb3_said.sac.policies import settings_of
+from sb3_said.said.ways import players_of
 
 SAID = Any  # whose module imports this one
 
 CUT_AT = 10  # times the longest stored episode: a good answer may never end one
 FIRST_PART = 0.25  # of a trial's episodes, which all ways play
 GO_ON = 3  # ways that play the others, too (simulated with episodes of 30 planners, results/settings.md)
-NAME_LENGTH = 25  # of a way; SB3's log takes longer ones that begin alike for the same
-
-DEFAULT_WAY: dict[str, Any] = {
-    "decided_by": "plan",
-    "temperature": 0.0,
-    "sampling_steps": PlannerConfig.sampling_steps,
-}
-#: What a trial compares with an agent's own settings: the mean of all candidates, weighed by the critics; the expert's
-#: actor on the present that the planner's first guess has; the default's steps; a single step; and the default's steps
-#: where the present is inpainted with the plan, for a guess may go wrong at old observations. Which is best
-#: depends on task, delay and budget (measured, results/what_diffusion_buys.md and results/settings.md). Where the trial
-#: cannot tell, the order does: the first was best or second with each of seven planners. "own_ages" is another planner,
-#: of decisions made at the age that it is shown: where an expert does one thing on new observations and another on old
-#: ones, the first learns the mean of both (results/what_diffusion_buys.md has where that gains, and where it loses).
-WAYS: dict[str, dict[str, Any]] = {
-    "weighed": {"decided_by": "plan", "temperature": 1.0, "sampling_steps": 2, "choice_factor": 1.0},
-    "actor": {"decided_by": "actor"},
-    "default": DEFAULT_WAY,
-    "one_step": {**DEFAULT_WAY, "sampling_steps": 1},
-    "inpainted": {**DEFAULT_WAY, "present": "inpainted"},
-    "own_ages": {**DEFAULT_WAY, "present": "inpainted", "mask": "own"},
-}
-WAY_SETTINGS = (*SAMPLING_SETTINGS, "mask")
 
 
 @dataclass(frozen=True)
@@ -57,94 +33,6 @@ class Trial:
     within episodes, which then differ in it from player to player"""
     n_steps: int
     """taken by all together, those of environments that wait for the others, too"""
-
-
-def ways_of(
-    given: dict[str, dict[str, Any]] | None, planner_kwargs: dict[str, Any], value: str
-) -> dict[str, dict[str, Any]]:
-    """Return the ways to compare: those given, or ``WAYS``; none where ``planner_kwargs`` says how to decide.
-
-    :param value: who scores candidates, as of :class:`~sb3_said.said.SAID`
-    :raises ValueError: for other settings than ``mask`` and those of ``set_planner``, and for values outside their
-        range, or that this planner cannot have
-    """
-    own = settings_of(PlannerConfig, planner_kwargs, "The planner")
-    if given is None:
-        if set(SAMPLING_SETTINGS) & set(planner_kwargs):
-            return {}
-        guesses = own.present == "guessed"
-        is_another = {
-            "actor": guesses,
-            "inpainted": guesses and own.mask != "none",
-            "own_ages": own.mask == "random",
-        }
-        ways = {name: way for name, way in WAYS.items() if is_another.get(name, True)}
-        if "own_ages" not in ways:
-            return ways
-        first = {"mask": own.mask, "present": own.present}  # also where the agent has the second's, later
-        return {name: {**first, **way} for name, way in ways.items()}
-    for name, settings in given.items():
-        if len(name) > NAME_LENGTH:
-            raise ValueError(f"planner_ways has the name {name!r}; expected at most {NAME_LENGTH} letters.")
-        if name in ("planner", "expert") or not set(settings) <= set(WAY_SETTINGS):
-            raise ValueError(
-                f"planner_ways has {name!r}: {settings}; expected another name than 'planner' and 'expert', with "
-                f"settings from {', '.join(WAY_SETTINGS)}."
-            )
-        in_way(own, settings)
-        check_scored(settings, value == "iql")
-    return given
-
-
-def in_way(own: PlannerConfig, settings: dict[str, Any]) -> PlannerConfig:
-    """Return a planner's settings changed to a way to decide.
-
-    Where ``decided_by`` and ``present`` contradict each other, the way's own stands, and the other is the default's.
-
-    :raises ValueError: for values outside their range, or that this planner cannot have
-    """
-    try:
-        return replace(own, **settings)
-    except ValueError:  # such as of the actor, where the agent inpaints the present now
-        return replace(own, **{"decided_by": "plan", "present": PlannerConfig.present, **settings})
-
-
-def _configs(model: SAID) -> dict[str, PlannerConfig]:
-    """Return the planner's settings in each of the agent's ways to decide."""
-    return {name: in_way(model.policy.planner.config, settings) for name, settings in model.planner_ways.items()}
-
-
-def masks_of(model: SAID) -> list[str]:
-    """Return the masks that the agent's ways to decide need a planner of, its planner's own first.
-
-    Where not every age of 0..D was trained on, or none is known, as of logs, there are no decisions of each age to
-    learn from: a planner of ``mask="own"`` would serve some delays alone.
-    """
-    own, max_delay = model.policy.planner.config.mask, model.policy.max_delay
-    knows_ages = max_delay > 0 and set(range(max_delay + 1)) <= set(model.trained_ages or [])
-    knows_ages &= not model.replay_buffer.holds_logs
-    others = {config.mask for config in _configs(model).values()} - {own} - (set() if knows_ages else {"own"})
-    return [own, *sorted(others)]
-
-
-def _players(model: SAID, planners: Sequence[InpaintingPlanner]) -> dict[str, tuple[InpaintingPlanner, PlannerConfig]]:
-    """Return who decides in each of the agent's ways that one of these planners, or its own, can play, and how."""
-    by_mask = {planner.config.mask: planner for planner in (*planners, model.policy.planner)}
-    return {name: (by_mask[way.mask], way) for name, way in _configs(model).items() if way.mask in by_mask}
-
-
-def check_scored(settings: dict[str, Any], is_by_state: bool) -> None:
-    """Refuse ways to score candidates in which V(s) would see no difference.
-
-    :param settings: of :meth:`~sb3_said.said.SAID.set_planner`
-    :param is_by_state: whether V(s) scores, and not Q(s, a)
-    :raises ValueError: for ``scored_states="decision"`` where V(s) scores
-    """
-    if settings.get("scored_states") == "decision" and is_by_state:
-        raise ValueError(
-            "scored_states='decision' scores candidates at the present that they share, where V(s) tells no action "
-            "from another: use 'future' or 'all'."
-        )
 
 
 def play_trial(
@@ -171,7 +59,7 @@ def play_trial(
     """
     policy, seed = model.policy, int(np.random.randint(2**31))
     own = policy.planner, policy.planner.config
-    players = _players(model, planners)
+    players = players_of(model, planners)
     named = {"planner" if player == own else name: player for name, player in players.items()} | {"planner": own}
     can_act = model.has_expert and 0 in (model.trained_ages or [])
     can_act &= policy.max_delay > 0  # without delay the actor is the expert
@@ -285,7 +173,7 @@ def let_the_best_answer(
     :param planners: beside the agent's own, as of :func:`play_trial`; the agent takes the one of the best way
     :return: mean returns, the expert's ages, and the number of steps played, for the log
     """
-    own, players = (model.policy.planner, model.policy.planner.config), _players(model, planners)
+    own, players = (model.policy.planner, model.policy.planner.config), players_of(model, planners)
     trial = play_trial(model, n_episodes, progress_bar, should_stop, planners)
     expert = trial.returns["expert"]
     played = {name: returns for name, returns in trial.returns.items() if len(returns) == len(expert)}

@@ -2,35 +2,30 @@
 
 from dataclasses import replace
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from small_agent import answer, make
-from small_task import delayed
+from small_task import delayed, pendulum
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_said import SAID, DelayedObservationWrapper
+from sb3_said import SAID
 from sb3_said.planner import trainer as trainer_module
 from sb3_said.planner.trainer import PlannerTrainer
-from sb3_said.said import trial
+from sb3_said.said import trial, ways
 from sb3_said.said.training import PLANNER_CHECKPOINT_NAME, SECOND_CHECKPOINT_NAME
 
 WAYS = {
     "first": {"mask": "random", "temperature": 0.0, "present": "guessed"},
-    "own_ages": trial.WAYS["own_ages"],
+    "own_ages": ways.WAYS["own_ages"],
 }
 SECOND = SECOND_CHECKPOINT_NAME.format(mask="own")
 
 
-def pendulum(delay=(0, 2)):
-    return DelayedObservationWrapper(gym.make("Pendulum-v1", max_episode_steps=15), delay, max_delay=2)
-
-
 def make_two(delay=(0, 2), **kwargs):
-    return make(env=pendulum(delay), planner_ways=WAYS, **kwargs)
+    return make(env=pendulum(delay=delay, max_delay=2), planner_ways=WAYS, **kwargs)
 
 
 def rig(monkeypatch, best):
@@ -87,7 +82,7 @@ def test_the_agent_keeps_the_planner_that_does_best(monkeypatch, updates, tmp_pa
     model.save(tmp_path / "agent.zip")
     loaded = SAID.load(tmp_path / "agent.zip", device="cpu")
     assert loaded.planner_kwargs["mask"] == "own" and loaded.planner_ways == WAYS
-    obs = pendulum().reset(seed=1)[0]
+    obs = pendulum(delay=(0, 2)).reset(seed=1)[0]
     np.testing.assert_array_equal(answer(loaded, obs), answer(model, obs))
 
 
@@ -131,8 +126,8 @@ def test_each_way_is_played_by_its_own_planner():
     np.random.seed(3)
     seed = int(np.random.randint(2**31))
     for name, planner in (("first", first), ("own_ages", second)):
-        model.policy.take_planner(planner, trial.in_way(before, WAYS[name]))
-        env = DummyVecEnv([lambda: Monitor(pendulum())])
+        model.policy.take_planner(planner, ways.in_way(before, WAYS[name]))
+        env = DummyVecEnv([lambda: Monitor(pendulum(delay=(0, 2)))])
         for i in range(2):
             env.seed(seed + i)
             assert played[name][i] == pytest.approx(evaluate_policy(model, env, 1)[0], rel=1e-5)
@@ -146,7 +141,13 @@ def test_by_default_there_are_two_and_one_of_a_fixed_delay_or_without_a_trial(up
     settings = {"learning_starts": 20, "buffer_size": 500, "seed": 0, "device": "cpu", "planner_gradient_steps": 3}
     for delay, episodes, masks in (((0, 2), 1, ["random", "own"]), (2, 1, ["random"]), ((0, 2), 0, ["random"])):
         updates.clear()
-        model = SAID("MlpPolicy", pendulum(delay), planner_kwargs=tiny, planner_trial_episodes=episodes, **settings)
+        model = SAID(
+            "MlpPolicy",
+            pendulum(delay=delay, max_delay=2),
+            planner_kwargs=tiny,
+            planner_trial_episodes=episodes,
+            **settings,
+        )
         model.learn(60)
         assert updates == [mask for mask in masks for _ in range(3)]
     assert make(env=delayed(), planner_ways={}).learn(60).policy.planner.config.mask == "random"

@@ -33,6 +33,11 @@ def delayed(delay=2, max_delay=None, **kwargs):
     return DelayedObservationWrapper(Drift(**kwargs), delay, max_delay=max_delay)
 
 
+def pendulum(n_steps=15, delay=2, max_delay=None):
+    """Return a task that pays each action differently, for as many steps."""
+    return DelayedObservationWrapper(gym.make("Pendulum-v1", max_episode_steps=n_steps), delay, max_delay=max_delay)
+
+
 class OwnDelay:
     """A user's own process, which a worker cannot be sent: its class is not where pickle looks for it."""
 
