@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -128,7 +128,7 @@ class PlannerTraining:
             if self.value_trainer is not None:
                 self.model.policy.values.load_state_dict(self.value_trainer.values.state_dict())
 
-    def log(self, values: dict[str, float]) -> None:
+    def log(self, values: Mapping[str, float | str]) -> None:
         """Write a row with a logger of its own, to the same places: the user's keeps what it holds for its next row."""
         log = Logger(self.model.logger.dir, self.model.logger.output_formats)
         log.set_level(self.model.logger.level)

@@ -164,14 +164,14 @@ def let_the_best_answer(
     progress_bar: bool = False,
     should_stop: Callable[[], bool] | None = None,
     planners: Sequence[InpaintingPlanner] = (),
-) -> dict[str, float]:
+) -> dict[str, float | str]:
     """Let the planner in its best way answer, or the expert, or both, each at the ages at which it does better.
 
     If the best way gains no more than its error over some, the first of these in ``planner_ways`` is taken. Both answer
     only if that :func:`gains_more_than_its_error` over the better of the two. Warn where the expert alone answers.
 
     :param planners: beside the agent's own, as of :func:`play_trial`; the agent takes the one of the best way
-    :return: mean returns, the expert's ages, and the number of steps played, for the log
+    :return: mean returns, the way that is taken, the expert's ages, and the number of steps played, for the log
     """
     own, players = (model.policy.planner, model.policy.planner.config), players_of(model, planners)
     trial = play_trial(model, n_episodes, progress_bar, should_stop, planners)
@@ -202,4 +202,4 @@ def let_the_best_answer(
     means = {f"trial/{name}_return": float(returns.mean()) for name, returns in trial.returns.items()}
     ages = model.policy.expert_ages  # up to -1 for none
     share = {"trial/expert_from": float(ages.start), "trial/expert_up_to": float(ages.stop - 1)}
-    return means | share | {"trial/steps": float(trial.n_steps)}
+    return {"trial/way": way, **means, **share, "trial/steps": float(trial.n_steps)}

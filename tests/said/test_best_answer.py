@@ -37,9 +37,13 @@ def test_the_planner_decides_in_its_best_way_whoever_answers(means, answers, mon
     ways = {"a": {"temperature": 0.5}, "b": {"temperature": 1.0, "choice_factor": 2.0}}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        model = make(planner_trial_episodes=2, planner_ways=ways).learn(60)
+        model = make(planner_trial_episodes=2, planner_ways=ways)
+        model.set_logger(configure(str(tmp_path), ["csv", "tensorboard"]))
+        model.learn(60)
     assert model.policy.who_answers == answers
     config = model.policy.planner.config
+    rows = list(csv.DictReader((tmp_path / "progress.csv").open()))
+    assert rows[-1]["trial/way"] == ("b" if answers == "planner" else "planner")
     assert (config.temperature, config.choice_factor) == ((1.0, 2.0) if answers == "planner" else (0.5, None))
     model.save(tmp_path / "agent.zip")
     loaded = SAID.load(tmp_path / "agent.zip", device="cpu")
@@ -192,5 +196,6 @@ def test_returns_and_steps_are_logged_behind_the_planners_rows(monkeypatch, tmp_
     model.train_planner()
     rows = list(csv.DictReader((tmp_path / "progress.csv").open()))
     assert [float(rows[-1][f"trial/{key}"]) for key in ("planner_return", "expert_return", "steps")] == [2.0, 1.0, 7.0]
+    assert rows[-1]["trial/way"] == "planner"  # as it decided before
     assert (float(rows[-1]["trial/expert_from"]), float(rows[-1]["trial/expert_up_to"])) == (0.0, -1.0)
     assert model.logger.name_to_value["mine"] == 7  # for the user's next row
