@@ -236,7 +236,7 @@ def test_v_has_the_agents_discount_and_seed():
 
 
 def test_callbacks_follow_each_update_meet_a_young_planner_and_can_end_it(monkeypatch):
-    monkeypatch.setattr("sb3_said.said.said.HAND_OVER_INTERVAL", 2)
+    monkeypatch.setattr("sb3_said.said.learning.HAND_OVER_INTERVAL", 2)
     seen = []
 
     class Watch(BaseCallback):

@@ -1,0 +1,281 @@
+"""How SAID's planner learns: from the expert's replay (paper, Algorithm 1), or from logs (Algorithm 2)."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch as th
+from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.utils import configure_logger
+
+from sb3_said.offline import IQL, ImplicitValues, OfflineAlgorithm, load_dataset
+from sb3_said.planner import InpaintingPlanner
+from sb3_said.planner.trainer import PlannerTrainer
+from sb3_said.planner.values import returns_to_go
+from sb3_said.said.policies import SAIDPolicy, Value
+from sb3_said.said.training import PlannerTraining
+from sb3_said.said.trial import let_the_best_answer
+from sb3_said.said.ways import in_way, masks_of, ways_of
+
+HELD_OUT = 0.05  # of the planner's data
+HAND_OVER_INTERVAL = 100  # updates of an offline training
+
+SelfLearner = TypeVar("SelfLearner", bound="PlannerLearner")
+
+
+class PlannerLearner(OfflineAlgorithm):
+    """An agent with a planner, which it trains; :class:`~sb3_said.said.SAID` sets what is declared here."""
+
+    policy: SAIDPolicy
+    planner_gradient_steps: int
+    planner_train_freq: int | None
+    planner_newest_fraction: float
+    planner_terminal_penalty: float | None
+    planner_trial_episodes: int
+    planner_ways: dict[str, dict[str, Any]]
+    value: Value
+    _planner_trained_at: int  # num_timesteps of the last planner training
+
+    def make_planner_trainer(
+        self, gradient_steps: int | None = None, planner: InpaintingPlanner | None = None
+    ) -> PlannerTrainer:
+        """Return a trainer of this agent's planner on its replay buffer.
+
+        :param gradient_steps: ``planner_gradient_steps`` by default
+        :param planner: in place of the agent's own, one of the same sizes
+        :raises ValueError: when the buffer is empty, as it is after ``load``
+        """
+        steps = self.planner_gradient_steps if gradient_steps is None else whole("gradient_steps", gradient_steps)
+        replay, newest, env = self.replay_buffer, self.newest_fraction, self._vec_normalize_env
+        source = replay.window_source(newest, env)
+        has_older = len(source) < replay.size() * replay.n_envs  # a log's replay has one, whatever the agent has
+        bootstrap = self._stored_values if self.has_expert else None  # offline there are no critics
+        values = returns_to_go(source, self.gamma, self.planner_terminal_penalty, bootstrap)
+        return PlannerTrainer(
+            planner or self.policy.planner,
+            replace(source, values=values),
+            steps,
+            held_out=HELD_OUT if len(source) > 1 else 0.0,
+            seed=self.seed or 0,
+            older=replay.window_source(newest, env, older=True) if has_older else None,
+        )
+
+    def train_planner(
+        self,
+        gradient_steps: int | None = None,
+        folder: str | Path | None = None,
+        progress_bar: bool = False,
+        log_interval: int = 500,
+        eval_interval: int = 2_000,
+        save_interval: int | None = None,
+        trial_episodes: int | None = None,
+        should_stop: Callable[[], bool] | None = None,
+    ) -> None:
+        """Train the planner anew on the replay buffer, without running the expert; then see who answers better.
+
+        Where a trial follows, each other ``mask`` that ``planner_ways`` names has a planner too, of as many updates.
+        The agent keeps the one that does best.
+
+        Interrupting (Ctrl-C) ends the training early and keeps the planner as far as it got. Until the training ends,
+        and where it fails, the planner answers as before. Without ``verbose`` and a bar, one line says that it begins.
+
+        A row of the log is written at ``num_timesteps`` plus the updates made; with ``planner_train_freq`` at
+        ``num_timesteps`` alone, since the expert's rows go on from there.
+
+        :param gradient_steps: ``planner_gradient_steps`` by default
+        :param folder: keep a checkpoint there, and continue from it if it is of the same training
+        :param progress_bar: show one
+        :param log_interval: updates between two rows of losses in the log
+        :param eval_interval: updates between two measurements of the held-out errors, beside the regression's
+        :param save_interval: updates between two checkpoints; by default ten minutes, and longer where they are large
+        :param trial_episodes: ``planner_trial_episodes`` by default; none are played where there is no environment, or
+            no expert to compare with
+        :param should_stop: asked after every update; where it says so, a checkpoint is written and the training ends
+        :raises KeyboardInterrupt: when ``should_stop`` has ended the training
+        :raises ValueError: when the buffer is empty, or the checkpoint is of a training with other settings
+        :raises FloatingPointError: when an update was not finite
+        """
+        learned_online = not self.replay_buffer.holds_logs  # of logs num_timesteps counts updates
+        if learned_online and not self.has_expert and 0 < self.num_timesteps <= self.learning_starts:
+            warnings.warn(
+                f"The expert has not learned yet: after {self.num_timesteps} steps, of which the first learning_starts="
+                f"{self.learning_starts} are random actions, the planner imitates those. Learn for longer.",
+                stacklevel=2,
+            )
+        if not hasattr(self, "_logger"):  # not set_logger: learn() makes its own
+            self._logger = configure_logger(self.verbose, self.tensorboard_log, "SAID", reset_num_timesteps=False)
+
+        n_episodes = self.planner_trial_episodes if trial_episodes is None else trial_episodes
+        is_tried = n_episodes > 0 and self._can_be_tried()
+
+        def train(planner: InpaintingPlanner, *before: InpaintingPlanner) -> tuple[PlannerTraining, str]:
+            def row(n_updates: int) -> int:
+                n_made = len(before) * trainer.gradient_steps + n_updates
+                return self.num_timesteps + (n_made if self.planner_train_freq is None else 0)
+
+            trainer, intervals = self.make_planner_trainer(gradient_steps, planner), (log_interval, eval_interval)
+            values = None if before else self._make_value_trainer()
+            training = PlannerTraining(self, trainer, values, row, folder, *intervals, save_interval)
+            if before:
+                trainer.take_first_guess(before[0])  # of the same data
+            if trainer.n_updates < trainer.gradient_steps and not progress_bar and self.verbose == 0:
+                print(
+                    f"Training the {training.name}: {trainer.gradient_steps} updates. progress_bar=True or verbose=1 "
+                    "shows how far it is.",
+                    flush=True,
+                )
+            return training, training.run(progress_bar, should_stop)
+
+        training, outcome = train(self.policy.planner)
+        if training.trainer.n_updates > 0:
+            self.policy.set_answer("planner")
+        planners = [self.policy.planner]
+        for mask in masks_of(self)[1:] if is_tried else []:
+            if outcome == "done":
+                planner = self.policy.new_planner(in_way(self.policy.planner.config, {"mask": mask}))
+                training, outcome = train(planner, *planners)
+                planners.append(planner)
+        if is_tried and outcome == "done":
+            training.log(let_the_best_answer(self, n_episodes, progress_bar, should_stop, planners[1:]))
+        if outcome == "stopped":
+            raise KeyboardInterrupt
+        self._planner_trained_at = self.num_timesteps
+
+    def learn_offline(  # type: ignore[override]
+        self: SelfLearner,
+        dataset: Any,
+        gradient_steps: int | None = None,
+        callback: MaybeCallback = None,
+        log_interval: int = 500,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+        folder: str | Path | None = None,
+        eval_interval: int = 2_000,
+        save_interval: int | None = None,
+        should_stop: Callable[[], bool] | None = None,
+    ) -> SelfLearner:
+        """Train the planner, and V(s) beside it, on logs of a task without delay (paper, Algorithm 2).
+
+        No environment is stepped and no expert is trained; the planner serves every delay 0..D. Callbacks are called
+        after each update, and meet a planner that is at most 100 updates old. ``num_timesteps`` counts updates.
+
+        :param dataset: whatever :func:`~sb3_said.offline.load_dataset` reads; None for what ``take_dataset`` took
+        :param gradient_steps: ``planner_gradient_steps`` by default
+        :param callback: SB3 callbacks, such as ``EvalCallback``
+        :param log_interval: updates between two rows of losses in the log
+        :param tb_log_name: name of the run in TensorBoard
+        :param reset_num_timesteps: has no effect: each training of a planner begins anew
+        :param progress_bar: show one
+        :param folder: keep a checkpoint there, and continue from it if it is of the same training
+        :param eval_interval: updates between two measurements of the held-out errors
+        :param save_interval: updates between two checkpoints; by default ten minutes, and longer where they are large
+        :param should_stop: as of :meth:`train_planner`
+        :raises KeyboardInterrupt: when ``should_stop`` has ended the training
+        :raises ValueError: as ``load_dataset`` and :meth:`train_planner` do
+        """
+        total = self.planner_gradient_steps if gradient_steps is None else whole("gradient_steps", gradient_steps)
+        with self._as_before_if_it_fails():
+            ways_of(self.planner_ways, self.policy.planner.config.to_dict(), "iql")  # refuses what V(s) cannot score
+            watcher = self._begin_offline(dataset, total, callback, tb_log_name, True, progress_bar)
+            self.value = "iql"
+            self.policy.set_value("iql")
+            trainer, values = self.make_planner_trainer(total), self._make_value_trainer()
+            intervals = log_interval, eval_interval, save_interval
+            training = PlannerTraining(self, trainer, values, lambda n_updates: n_updates, folder, *intervals, watcher)
+            self.num_timesteps = trainer.n_updates
+            if not trainer.make_first_guess(progress_bar, should_stop):
+                raise KeyboardInterrupt
+            watcher.on_training_start(locals() | {"total_timesteps": total, "callback": watcher}, globals())
+
+        is_new = True
+
+        def on_step(n_updates: int) -> bool:
+            nonlocal is_new
+            self.num_timesteps = n_updates
+            if is_new or n_updates % HAND_OVER_INTERVAL == 0:  # else an expert that learns nothing would answer
+                training.hand_over()
+                is_new = False
+            return self._goes_on(watcher)
+
+        outcome = training.run(should_stop=should_stop, on_step=on_step)
+        if trainer.n_updates > 0:
+            self.policy.set_answer("planner")
+        if outcome == "stopped":
+            raise KeyboardInterrupt
+        watcher.on_training_end()
+        return self
+
+    @property
+    def has_expert(self) -> bool:
+        """Whether actor and critics have learned, here or where ``set_parameters`` has them from."""
+        return self._n_updates > 0 or len(self.actor.optimizer.state) > 0
+
+    @property
+    def newest_fraction(self) -> float:
+        """The part of the replay that is imitated: all of a log, no step of which is newer than another."""
+        return 1.0 if self.replay_buffer.holds_logs else self.planner_newest_fraction
+
+    @th.no_grad()
+    def _stored_values(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """Return values as the environment's rewards would sum up, of states as windows have them: (B,)."""
+        self.critic.set_training_mode(False)  # until the next update; batch norm must not learn from this
+        values = self.policy.q_value(states.to(self.device), actions.to(self.device)).cpu()
+        env = self._vec_normalize_env
+        return values if env is None else th.from_numpy(env.unnormalize_reward(values.numpy()))
+
+    def _make_value_trainer(self) -> IQL | None:
+        """Return a trainer of V(s) on the replay buffer, where that is who values plans."""
+        if self.policy.values is None:
+            return None
+        data, env = load_dataset(self.replay_buffer, self.observation_space, self.action_space), self._vec_normalize_env
+        if env is not None:  # V reads states as the planner has them
+            normalized = self.replay_buffer.normalized
+            data = replace(data, states=normalized(data.states, env), finals=normalized(data.finals, env))
+        with th.random.fork_rng(devices=[]):
+            th.default_generator.manual_seed(self.seed or 0)
+            sizes = data.states.shape[1], data.actions.shape[1]
+            values = ImplicitValues(*sizes, self.policy.iql_config).to(self.device)
+        return IQL(values, data, self.gamma, self.seed or 0)
+
+    def _can_be_tried(self) -> bool:
+        """Tell whether planner and expert can be played. Warn where episodes might never end."""
+        if self.env is None or not self.has_expert:
+            return False
+        if self.replay_buffer.dones[: self.replay_buffer.size()].any():
+            return True
+        warnings.warn(
+            "No episode has ended in what the agent has stored, so a trial might never end: the planner answers as it "
+            "is. train_planner() plays one later; set_answer() and set_planner() choose.",
+            stacklevel=3,
+        )
+        return False
+
+    @contextmanager
+    def _as_before_if_it_fails(self) -> Iterator[None]:
+        """Take back what a training from logs changes before its first update, if it gets no further."""
+        names = "replay_buffer", "num_timesteps", "value"
+        before, policy = {name: getattr(self, name) for name in names}, self.policy
+        values, config = policy.values, policy.planner.config
+        try:
+            yield
+        except BaseException:
+            for name, value in before.items():
+                setattr(self, name, value)
+            policy.values, policy.planner.config = values, config
+            raise
+
+
+def whole(name: str, given: float, least: int = 1) -> int:
+    """Return a count; 1e4 is a float in YAML and in -params.
+
+    :raises ValueError: for one below the least, or no whole number
+    """
+    if given < least or given % 1 != 0:
+        raise ValueError(f"{name} must be a whole number, at least {least}, got {given}.")
+    return int(given)
