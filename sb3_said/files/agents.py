@@ -170,6 +170,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
             own_networks = not any(isinstance(value, (dict, type)) for value in (given | kwargs).values())
             with no_larger_than(saved["parameters"]["policy"]) if own_networks else contextlib.nullcontext():
                 model._setup_model()
+            model._check_file(saved)
             restore_agent(model, saved)
             metadata = load_metadata(path)
             model.task, model.reads_normalized = task_of(metadata), metadata["metadata"].get("reads_normalized") is True
@@ -197,7 +198,8 @@ class SafeSaveMixin(OffPolicyAlgorithm):
             return
         path = existing(load_path_or_dict)
         saved = load_tree(path, kind=None)
-        with readable(path):
+        with readable(path, explained=(ValueError,)):
+            self._check_file(saved)
             _take_parameters(self, _fitting_parameters(self, saved["parameters"], exact_match), exact_match)
 
     @classmethod
@@ -226,6 +228,12 @@ class SafeSaveMixin(OffPolicyAlgorithm):
             nearest = get_close_matches(unknown, names, n=1)
             hint = f"did you mean {nearest[0]}?" if nearest else f"it has {', '.join(names)}."
             raise TypeError(f"{cls.__name__} has no argument {unknown}; {hint}")
+
+    def _check_file(self, saved: dict[str, Any]) -> None:
+        """Look at a file whose parameters are about to be taken over; an algorithm may refuse it.
+
+        :raises ValueError: for one that does not go with this agent
+        """
 
     def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:
         """Return the state dicts to take over from those given; an algorithm may keep some of its own."""

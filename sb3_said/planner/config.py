@@ -15,6 +15,8 @@ from sb3_said.planner.values import VALUE_SCALES
 SAMPLING_SETTINGS = (
     "sampling_steps", "n_candidates", "temperature", "scored_states", "choice_factor", "present", "decided_by"
 )  # fmt: skip
+#: Settings that say what weights of the same shapes mean.
+WEIGHT_SETTINGS = ("prediction", "schedule", "mask", "relative_states", "action_transform")
 CHOICES: dict[str, tuple[str, ...]] = {
     "first_guess": ("prior", "none"),
     "prediction": PREDICTIONS,

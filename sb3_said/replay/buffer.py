@@ -18,6 +18,7 @@ from sb3_said.replay.stored import ROW_ARRAYS, check_stored
 from sb3_said.replay.windows import Windows, WindowSource
 
 UNCHANGED = 1e-3  # of [-1, 1]: what a wrapper's arithmetic in float32 may be off by
+NORMALIZED_ROWS = 10_000  # at a time
 
 
 class DelayedReplayBuffer(ReplayBuffer):
@@ -359,19 +360,26 @@ class DelayedReplayBuffer(ReplayBuffer):
         last = np.where(ends, np.arange(n_rows)[:, None], n_rows)
         last = np.minimum.accumulate(last[::-1], axis=0)[::-1]  # (T, n_envs): where each episode ends
 
-        states = self.observations if env is None else self.normalized(self.observations, env)
+        states = self.observations if env is None else self._normalized_rows(rows, env)
         grid = np.broadcast_to(rows[:, None], ends.shape), np.broadcast_to(np.arange(self.n_envs), ends.shape)
         remaining = last - np.arange(n_rows)[:, None] + 1
         episodes = last + np.arange(self.n_envs) * n_rows  # unique for each environment and end
         ages = () if self.holds_logs else (self.ages[rows].astype(np.int64),)  # a log knows none
         per_start = (*grid, remaining, episodes, np.zeros(ends.shape, np.float32), *ages)
         return WindowSource(
-            th.from_numpy(np.asarray(states, np.float32)),
+            th.from_numpy(states),
             th.from_numpy(self.actions),
             th.from_numpy(self.rewards),
             th.from_numpy((self.dones > 0) & (self.timeouts == 0)),
             *(th.from_numpy(x.flatten()) for x in per_start),  # a copy: the grid is read-only
         )
+
+    def _normalized_rows(self, rows: np.ndarray, env: VecNormalize) -> np.ndarray:
+        """Return states as :meth:`normalized`, where the buffer has them; memory is taken for these rows alone."""
+        states = np.zeros(self.observations.shape, np.float32)  # the system gives what is never touched no memory
+        for part in np.array_split(rows, -(-len(rows) // NORMALIZED_ROWS)):  # through float64
+            states[part] = self.normalized(self.observations[part], env)
+        return states
 
     def normalized(self, states: np.ndarray, env: VecNormalize) -> np.ndarray:
         """Return states (..., obs_dim) as the expert's observations are normalised."""

@@ -13,13 +13,14 @@ import torch as th
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import configure_logger
 
+from sb3_said.delays.space import ages_of
 from sb3_said.offline import IQL, ImplicitValues, OfflineAlgorithm, load_dataset
 from sb3_said.planner import InpaintingPlanner
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.planner.values import returns_to_go
 from sb3_said.said.policies import SAIDPolicy, Value
 from sb3_said.said.training import PlannerTraining
-from sb3_said.said.trial import let_the_best_answer
+from sb3_said.said.trial import let_the_best_answer, stopped_alone
 from sb3_said.said.ways import in_way, masks_of, ways_of
 
 HELD_OUT = 0.05  # of the planner's data
@@ -40,6 +41,7 @@ class PlannerLearner(OfflineAlgorithm):
     planner_ways: dict[str, dict[str, Any]]
     value: Value
     _planner_trained_at: int  # num_timesteps of the last planner training
+    _expert_is_given: bool  # by a file of set_parameters
 
     def make_planner_trainer(
         self, gradient_steps: int | None = None, planner: InpaintingPlanner | None = None
@@ -54,7 +56,7 @@ class PlannerLearner(OfflineAlgorithm):
         replay, newest, env = self.replay_buffer, self.newest_fraction, self._vec_normalize_env
         source = replay.window_source(newest, env)
         has_older = len(source) < replay.size() * replay.n_envs  # a log's replay has one, whatever the agent has
-        bootstrap = self._stored_values if self.has_expert else None  # offline there are no critics
+        bootstrap = self._stored_values if self.has_expert and not replay.holds_logs else None  # critics know no logs
         values = returns_to_go(source, self.gamma, self.planner_terminal_penalty, bootstrap)
         return PlannerTrainer(
             planner or self.policy.planner,
@@ -81,8 +83,9 @@ class PlannerLearner(OfflineAlgorithm):
         Where a trial follows, each other ``mask`` that ``planner_ways`` names has a planner too, of as many updates.
         The agent keeps the one that does best.
 
-        Interrupting (Ctrl-C) ends the training early and keeps the planner as far as it got. Until the training ends,
-        and where it fails, the planner answers as before. Without ``verbose`` and a bar, one line says that it begins.
+        Interrupting (Ctrl-C) ends the training, or the trial, early and keeps the planner as far as it got. Until the
+        training ends, and where it fails, the planner answers as before. Without ``verbose`` and a bar, one line says
+        that it begins.
 
         A row of the log is written at ``num_timesteps`` plus the updates made; with ``planner_train_freq`` at
         ``num_timesteps`` alone, since the expert's rows go on from there.
@@ -141,7 +144,8 @@ class PlannerLearner(OfflineAlgorithm):
                 training, outcome = train(planner, *planners)
                 planners.append(planner)
         if is_tried and outcome == "done":
-            training.log(let_the_best_answer(self, n_episodes, progress_bar, should_stop, planners[1:]))
+            with stopped_alone():
+                training.log(let_the_best_answer(self, n_episodes, progress_bar, should_stop, planners[1:]))
         if outcome == "stopped":
             raise KeyboardInterrupt
         self._planner_trained_at = self.num_timesteps
@@ -214,7 +218,7 @@ class PlannerLearner(OfflineAlgorithm):
     @property
     def has_expert(self) -> bool:
         """Whether actor and critics have learned, here or where ``set_parameters`` has them from."""
-        return self._n_updates > 0 or len(self.actor.optimizer.state) > 0
+        return self._n_updates > 0 or len(self.actor.optimizer.state) > 0 or self._expert_is_given
 
     @property
     def newest_fraction(self) -> float:
@@ -244,8 +248,13 @@ class PlannerLearner(OfflineAlgorithm):
         return IQL(values, data, self.gamma, self.seed or 0)
 
     def _can_be_tried(self) -> bool:
-        """Tell whether planner and expert can be played. Warn where episodes might never end."""
+        """Tell whether planner and expert can be played. Warn where the planner cannot, or episodes might never end."""
         if self.env is None or not self.has_expert:
+            return False
+        try:
+            self.policy.planner.check_ages(ages_of(self.env))
+        except ValueError as error:
+            warnings.warn(f"No trial is played, and the planner answers: {error}", stacklevel=3)
             return False
         if self.replay_buffer.dones[: self.replay_buffer.size()].any():
             return True

@@ -15,6 +15,7 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_said.delays.space import KEYS, STATE_KEYS, UNDELAYED, check_spaces, has_state_history
+from sb3_said.files.archive import PathOrFile
 from sb3_said.offline.iql import ImplicitValues, IQLConfig
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner.graphs import EAGER_CALLS
@@ -399,12 +400,23 @@ class SAIDPolicy(DelayedSACPolicy):
         arrays = {key: np.zeros((batch_size, *(part.shape or ())), np.float32) for key, part in parts.items()}
         on_gpu = self.device.type == "cuda"
         calls = range(EAGER_CALLS + 1 if on_gpu else 1)
+        players: tuple[Answer, ...] = ("expert", "planner") if self.who_answers == "both" else (self.who_answers,)
         with th.random.fork_rng(devices=[self.device] if on_gpu else []):  # later draws stay the same
-            for delay, deterministic, _ in product((0, self.max_delay), (True, False), calls):
+            for who, delay, deterministic, _ in product(players, (0, self.max_delay), (True, False), calls):
                 if "delay" in arrays:
                     arrays["delay"][:] = delay
                 obs = arrays if isinstance(space, spaces.Dict) else arrays["observation"]
-                self.predict(obs, deterministic=deterministic)
+                with self.answering(who):
+                    self.predict(obs, deterministic=deterministic)
+
+    def save(self, path: PathOrFile) -> None:
+        """Write all that ``predict`` needs to a file, which answers as the policy does now; amid ``learn`` the expert.
+
+        :param path: where to write, as it is. Or a binary file object.
+        :raises ValueError: if a constructor argument cannot be written without pickle
+        """
+        with self.preferring_who_answers():
+            super().save(path)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {

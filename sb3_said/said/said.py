@@ -14,9 +14,10 @@ from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from sb3_said.delays.space import ages_of, has_state_history
 from sb3_said.files.archive import PathOrFile
+from sb3_said.files.arguments import from_data
 from sb3_said.offline import IQLConfig, OfflineAlgorithm
 from sb3_said.offline.learning import listed
-from sb3_said.planner.config import SAMPLING_SETTINGS
+from sb3_said.planner.config import SAMPLING_SETTINGS, WEIGHT_SETTINGS
 from sb3_said.sac import StableSAC
 from sb3_said.sac.policies import settings_of
 from sb3_said.said.callbacks import PlannerTrainingCallback
@@ -106,7 +107,8 @@ class SAID(PlannerLearner, StableSAC):
         self.value = value
         self.iql_kwargs = asdict(settings_of(IQLConfig, iql_kwargs, "IQL"))
         self.student_width = student_width
-        self._planner_trained_at = 0  # num_timesteps of the last planner training
+        self._planner_trained_at = 0
+        self._expert_is_given = False
         super().__init__(policy, env, learning_rate, **sac_kwargs)
 
     @property
@@ -135,6 +137,18 @@ class SAID(PlannerLearner, StableSAC):
     def _policy_flags(self) -> dict[str, Any]:
         own = {name: getattr(self, name) for name in ("planner_kwargs", "value", "iql_kwargs", "student_width")}
         return {**super()._policy_flags(), **own}
+
+    def _check_file(self, saved: dict[str, Any]) -> None:
+        """Refuse a trained planner of other settings than this agent's, of which its weights mean something else."""
+        super()._check_file(saved)
+        self._expert_is_given = saved["counters"]["_n_updates"] > 0
+        given, own = from_data(saved["arguments"].get("planner_kwargs", {})), self.planner_kwargs
+        others = [name for name in WEIGHT_SETTINGS if name in given and given[name] != own[name]]
+        if others and saved["parameters"]["policy"]["planner_updates"] > 0:
+            raise ValueError(
+                f"its planner was trained with {', '.join(f'{name}={given[name]!r}' for name in others)}, and is asked "
+                f"for with {', '.join(f'{name}={own[name]!r}' for name in others)}. Leave these out, or train anew"
+            )
 
     def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:
         """Keep this agent's own planner where the given one was never trained and has other settings."""

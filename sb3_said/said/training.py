@@ -16,10 +16,12 @@ from sb3_said.files.archive import load_tree, readable, save_tree
 from sb3_said.files.checkpoint import CheckpointClock, checksum, evaluations_of, restore_evaluations
 from sb3_said.offline.iql import IQL
 from sb3_said.planner.checks import check_same
+from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.trainer import PlannerTrainer, worse_than_regression
+from sb3_said.sac.policies import settings_of
 
 PLANNER_CHECKPOINT_NAME = "planner_checkpoint.zip"
-SECOND_CHECKPOINT_NAME = "planner_{mask}_checkpoint.zip"  # of a planner beside the agent's own
+SECOND_CHECKPOINT_NAME = "planner_{mask}_checkpoint.zip"  # of one of another mask than the agent was made with
 
 SAID = Any  # whose module imports this one
 
@@ -53,7 +55,9 @@ class PlannerTraining:
         self.is_agents = trainer.planner is model.policy.planner  # or one beside it, for a trial
         mask = trainer.config.mask
         self.name = "planner" if self.is_agents else f"planner of mask={mask!r}"
-        file = PLANNER_CHECKPOINT_NAME if self.is_agents else SECOND_CHECKPOINT_NAME.format(mask=mask)
+        # By mask, as a trial may have made the other planner the agent's own
+        first = settings_of(PlannerConfig, model._given_planner_kwargs, "The planner").mask
+        file = PLANNER_CHECKPOINT_NAME if mask == first else SECOND_CHECKPOINT_NAME.format(mask=mask)
         self._clock = None if folder is None else CheckpointClock(Path(folder) / file)
         self.watcher = watcher
         self._data = {"num_timesteps": model.num_timesteps, "replay": checksum(model)}

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -21,6 +22,21 @@ FIRST_PART = 0.25  # of a trial's episodes, which all ways play
 GO_ON = 3  # ways that play the others, too (simulated with episodes of 30 planners, results/settings.md)
 
 
+class TrialStopped(KeyboardInterrupt):
+    """Raised where ``should_stop`` ends a trial, and not the user."""
+
+
+@contextmanager
+def stopped_alone() -> Iterator[None]:
+    """Let Ctrl-C end the trial that is played inside, and nothing else."""
+    try:
+        yield
+    except TrialStopped:
+        raise
+    except KeyboardInterrupt:
+        print("The trial was interrupted: the planner answers as it is. train_planner() plays one later.")
+
+
 @dataclass(frozen=True)
 class Trial:
     """What :func:`play_trial` measured."""
@@ -29,8 +45,9 @@ class Trial:
     """(n_episodes,) of each of ``planner_ways``, in their order; of "planner", in the place of the way that is its own
     or behind them; and of "expert". Undiscounted, in the task's own rewards. Fewer of ways that were given up"""
     ages: np.ndarray
-    """(n_episodes,) age of the observations of each, amid the episode, in control steps; 0 for all where it changes
-    within episodes, which then differ in it from player to player"""
+    """(n_episodes,) age of the observations of each, amid the episode, in control steps; of one that ends before an
+    action shows, the largest, whose player begins all episodes; 0 for all where it changes within episodes, which then
+    differ in it from player to player"""
     n_steps: int
     """taken by all together, those of environments that wait for the others, too"""
 
@@ -55,7 +72,7 @@ def play_trial(
     :param progress_bar: show one
     :param should_stop: asked after every step
     :param planners: other trained planners, which ways of their masks play; ways whose mask none has are left out
-    :raises KeyboardInterrupt: when ``should_stop`` has ended the trial
+    :raises TrialStopped: when ``should_stop`` has ended the trial
     """
     policy, seed = model.policy, int(np.random.randint(2**31))
     own = policy.planner, policy.planner.config
@@ -79,7 +96,7 @@ def play_trial(
             returns[name] = np.append(returns[name], found)
             met.append(met_ages)
             n_steps += n_played
-        ages = np.append(ages, np.max(met, axis=0))  # whoever falls at once meets young observations alone
+        ages = np.append(ages, np.min(met, axis=0))  # whoever falls at once does not tell it
 
     try:
         with model.borrowed_env() as env:
@@ -97,6 +114,14 @@ def play_trial(
 def _if_settled(ages: np.ndarray) -> np.ndarray:
     """Return episodes' ages, or 0 for all where one changed within an episode, which is NaN here."""
     return np.zeros(len(ages)) if np.isnan(ages).any() else ages
+
+
+def _settled_age(ages: np.ndarray, max_delay: int) -> float:
+    """Return an episode's age, from those (T,) of its steps; NaN where it changes."""
+    if np.all(ages == np.arange(len(ages))):  # s_0 is all that has arrived
+        return max_delay
+    settled = ages[min(max_delay, len(ages) - 1) :]
+    return float(settled[0]) if np.all(settled == settled[0]) else np.nan
 
 
 def _play(
@@ -119,13 +144,11 @@ def _play(
             sums, n_steps = sums + rewards, n_steps + env.num_envs
             for i in np.flatnonzero(is_played & (dones | (len(ages) == longest))):
                 returns[first + i] = infos[i].get("episode", {}).get("r", sums[i])  # the task's, where a Monitor saw it
-                young = min(model.policy.max_delay, len(ages) - 1)  # steps in which the episode is
-                settled = np.stack(ages)[young:, i]
-                settled_ages[first + i] = settled[0] if np.all(settled == settled[0]) else np.nan
+                settled_ages[first + i] = _settled_age(np.stack(ages)[:, i], model.policy.max_delay)
                 is_played[i] = False
                 bar.update()
             if should_stop is not None and should_stop():
-                raise KeyboardInterrupt
+                raise TrialStopped
     return returns, settled_ages, n_steps
 
 

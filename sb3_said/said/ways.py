@@ -101,16 +101,27 @@ def masks_of(model: SAID) -> list[str]:
     own, max_delay = model.policy.planner.config.mask, model.policy.max_delay
     knows_ages = max_delay > 0 and set(range(max_delay + 1)) <= set(model.trained_ages or [])
     knows_ages &= not model.replay_buffer.holds_logs
-    others = {config.mask for config in _configs(model).values()} - {own} - (set() if knows_ages else {"own"})
+    without = set() if knows_ages else {"own"}
+    if model.trained_ages != [max_delay]:
+        without |= {"fixed"}  # which plans at the largest age alone
+    others = {config.mask for config in _configs(model).values()} - {own} - without
     return [own, *sorted(others)]
 
 
 def players_of(
     model: SAID, planners: Sequence[InpaintingPlanner]
 ) -> dict[str, tuple[InpaintingPlanner, PlannerConfig]]:
-    """Return who decides in each of the agent's ways that one of these planners, or its own, can play, and how."""
+    """Return who decides in each of the agent's ways that one of these planners, or its own, can play, and how.
+
+    Without delay the present is seen, so that a way that inpaints it is left out beside one that does not.
+    """
     by_mask = {planner.config.mask: planner for planner in (*planners, model.policy.planner)}
-    return {name: (by_mask[way.mask], way) for name, way in _configs(model).items() if way.mask in by_mask}
+    configs = {name: way for name, way in _configs(model).items() if way.mask in by_mask}
+    if model.policy.max_delay == 0:
+        guessing = [way for way in configs.values() if way.decided_by == "plan" and way.present == "guessed"]
+        twins = [replace(way, present="inpainted") for way in guessing]
+        configs = {name: way for name, way in configs.items() if way not in twins}
+    return {name: (by_mask[way.mask], way) for name, way in configs.items()}
 
 
 def check_scored(settings: dict[str, Any], is_by_state: bool) -> None:

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_said.replay import buffer as buffer_module
 from sb3_said.replay.buffer import DelayedReplayBuffer
 from sb3_said.replay.windows import WindowSource
 
@@ -316,3 +317,23 @@ def test_windows_of_a_gpu_are_those_of_the_cpu():
         assert b.is_cuda and th.equal(a, b.cpu())
     drawn = on_gpu.sample(64, 4, th.Generator("cuda").manual_seed(0))
     assert drawn.states.is_cuda and len(drawn.states[:, 0].unique(dim=0)) > 10
+
+
+def test_only_the_states_that_windows_can_show_are_normalised_and_few_at_a_time(monkeypatch):
+    monkeypatch.setattr(buffer_module, "NORMALIZED_ROWS", 7)
+    player = Player(2, 1, 3)
+    buffer = make_buffer(player, 500, player.play(60))
+    env, asked = VecNormalize(player.vec, norm_obs_keys=["observation"]), []
+    env.obs_rms["observation"].mean += 3.0
+    normalize = env.normalize_obs
+
+    def counted(obs):
+        asked.append(len(obs["observation"]))
+        return normalize(obs)
+
+    monkeypatch.setattr(env, "normalize_obs", counted)
+    newest, older = buffer.window_source(0.3, env), buffer.window_source(0.3, env, older=True)
+    assert sum(asked) == 60 and max(asked) == 7
+    states = normalize({"observation": buffer.observations[:60]})["observation"].astype(np.float32)
+    np.testing.assert_array_equal(th.cat([older.states[:42], newest.states[42:60]]), states)
+    assert not newest.states[60:].any() and not newest.states[:42].any()

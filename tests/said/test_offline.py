@@ -286,6 +286,12 @@ def test_a_failed_training_changes_nothing(monkeypatch):
     th.testing.assert_close(weights(model), before, rtol=0, atol=0)
 
 
+def test_an_expert_of_other_steps_values_no_logs(monkeypatch):
+    model = make().learn(60)
+    monkeypatch.setattr(model, "_stored_values", lambda *_: pytest.fail("asked the critics"))
+    learn(model)
+
+
 def test_logs_are_learned_from_at_every_age():
     model = make(delayed(delay=(0, 2))).learn_offline(log(), 3)
     obs = observe(env=delayed(delay=1, max_delay=2))

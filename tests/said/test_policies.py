@@ -16,6 +16,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_said import SAID, DelayedObservationWrapper, StableSAC
 from sb3_said.delays import UniformDelay
+from sb3_said.said.policies import SAIDPolicy
 
 
 def test_value_is_the_smallest_critic(trained):
@@ -264,6 +265,31 @@ def test_every_agent_can_be_warmed_up(planner_kwargs):
         model.warmup()  # the expert answers
         model.policy.planner_updates.fill_(1)
         model.warmup(2)
+
+
+@pytest.mark.parametrize("ages", [{"expert_from": 2}, {"expert_up_to": 0}])
+def test_where_both_answer_both_are_warmed_up(ages, monkeypatch):
+    model, called = make(), []
+    model.policy.planner_updates.fill_(1)
+    model.policy.set_answer("both", **ages)
+    decide = model.policy._decide
+
+    def noted(observation, is_experts, deterministic):
+        called.append((is_experts, int(observation["delay"].max())))
+        return decide(observation, is_experts, deterministic)
+
+    monkeypatch.setattr(model.policy, "_decide", noted)
+    model.warmup()
+    assert set(called) == {(True, 0), (True, 2), (False, 0), (False, 2)}
+    assert model.policy.who_answers == "both"
+
+
+def test_a_policy_that_is_saved_while_another_answers_keeps_that(saved, tmp_path):
+    model = SAID.load(saved, device="cpu")
+    model.set_answer("planner")
+    with model.policy.answering("expert"):
+        model.policy.save(tmp_path / "policy")
+    assert SAIDPolicy.load(tmp_path / "policy").who_answers == "expert" and model.policy.who_answers == "planner"
 
 
 # ---------------------------------------------------------------------------------------------------- known states

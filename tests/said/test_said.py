@@ -21,6 +21,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_said import SAID, PlannerConfig, StableSAC
 from sb3_said.delays import TotalDelay, UniformDelay
+from sb3_said.files.archive import SavedFileError
 from sb3_said.offline import IQLConfig
 
 # ---------------------------------------------------------------------------------------------------- the expert
@@ -344,6 +345,31 @@ def test_only_an_untrained_planner_may_be_of_other_settings(trained, tmp_path):
     assert len(deeper.policy.planner.network.blocks) == 2
     with pytest.raises(RuntimeError, match="planner"):
         deeper.set_parameters(trained.get_parameters())
+
+
+@pytest.mark.parametrize(
+    "other", [{"relative_states": False}, {"prediction": "epsilon"}, {"mask": "none"}, {"action_transform": "tanh"}]
+)
+def test_a_trained_planner_is_not_taken_over_where_its_weights_mean_something_else(other, trained, saved, tmp_path):
+    (name,) = other
+    with pytest.raises(SavedFileError, match=f"trained with {name}=.* asked for with {name}="):
+        SAID.load(saved, planner_kwargs=other, device="cpu")
+    model = make(planner_kwargs=other)
+    before = answer(model, observe())
+    with pytest.raises(SavedFileError, match=name):
+        model.set_parameters(saved)
+    assert np.array_equal(answer(model, observe()), before)
+    make(seed=4).save(tmp_path / "untrained.zip")
+    loaded = SAID.load(tmp_path / "untrained.zip", planner_kwargs=other, device="cpu")
+    assert loaded.planner_kwargs[name] == other[name]
+
+
+def test_an_expert_from_a_file_without_optimizers_is_one(trained, tmp_path):
+    for agent, has_expert in ((trained, True), (make(), False)):
+        agent.save(tmp_path / "compact.zip", compact=True)
+        model = make()
+        model.set_parameters(tmp_path / "compact.zip")
+        assert model.has_expert == has_expert
 
 
 # ---------------------------------------------------------------------------------------------------- learning

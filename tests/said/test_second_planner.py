@@ -86,6 +86,17 @@ def test_the_agent_keeps_the_planner_that_does_best(monkeypatch, updates, tmp_pa
     np.testing.assert_array_equal(answer(loaded, obs), answer(model, obs))
 
 
+def test_a_training_in_a_folder_is_gone_on_with_whichever_planner_the_agent_kept(monkeypatch, updates, tmp_path):
+    rig(monkeypatch, "own_ages")
+    model = make_two().learn(60)
+    model.train_planner(folder=tmp_path, trial_episodes=3)
+    assert model.planner_kwargs["mask"] == "own"
+    second = weights(model.policy.planner)
+    updates.clear()
+    model.train_planner(folder=tmp_path, trial_episodes=3)
+    assert updates == [] and same(weights(model.policy.planner), second)
+
+
 def test_both_begin_with_one_first_guess(monkeypatch):
     trained, fit = [], trainer_module.fit_first_guess
 

@@ -17,7 +17,7 @@ from sb3_said.delays import UniformDelay
 from sb3_said.planner import trainer as trainer_module
 from sb3_said.planner.trainer import GUESS_UPDATES_EACH
 from sb3_said.said import trial
-from sb3_said.said.ways import WAYS
+from sb3_said.said.ways import WAYS, masks_of
 
 OF_ONE_PLANNER = {name: way for name, way in WAYS.items() if name != "own_ages"}
 
@@ -89,11 +89,11 @@ def test_without_delay_the_actor_is_the_expert_and_not_tried_twice():
 
 
 def test_who_falls_at_once_does_not_tell_an_episodes_age(trained, monkeypatch):
-    """The planner ends its second episode before an observation is 2 steps old."""
-    ages = iter([[0.0, 1.0], [0.0, 2.0], [0.0, 1.0]])
+    """The planner ends its second episode before an observation shows an action, as if it were 2 steps old."""
+    ages = iter([[0.0, 2.0], [0.0, 1.0], [0.0, 2.0]])
     monkeypatch.setattr(trained, "planner_ways", {"one_step": WAYS["one_step"]})
     monkeypatch.setattr(trial, "_play", lambda *_: (np.ones(2), np.array(next(ages)), 1))
-    np.testing.assert_array_equal(trial.play_trial(trained, 2).ages, [0.0, 2.0])
+    np.testing.assert_array_equal(trial.play_trial(trained, 2).ages, [0.0, 1.0])
 
 
 def test_the_monitor_file_holds_the_training_and_not_the_trial(tmp_path):
@@ -270,3 +270,63 @@ def test_the_same_seed_gives_the_same_trial():
     first, second = returns(), returns()
     for who in first:
         np.testing.assert_array_equal(first[who], second[who])
+
+
+class Split(Drift):
+    """Chance decides at the reset whether an episode has 4 steps, which pay the action, or 20, which cost a little."""
+
+    def reset(self, **kwargs):
+        state, info = super().reset(**kwargs)
+        self.length = 4 if self.np_random.random() < 0.5 else 20
+        return state, info
+
+    def step(self, action):
+        state, _, ended, *_ = super().step(action)
+        return state, float(action[0]) * (5.0 if self.length == 4 else -0.1), ended, False, {}
+
+
+@pytest.mark.parametrize("delay", [6, (4, 6)])
+def test_an_episode_that_ends_before_an_action_shows_is_of_who_begins_episodes(delay, monkeypatch):
+    """The planner is the better one in short episodes, and worse in long ones by less."""
+    env = DelayedObservationWrapper(Split(truncates=False), delay)
+    model, sign = make(env=env, planner_ways={}).learn(80), {"planner": 1.0, "expert": -1.0}
+    monkeypatch.setattr(
+        model, "predict", lambda obs, **_: (np.full((1, 1), sign[model.policy.who_answers], np.float32), None)
+    )
+    found = trial.play_trial(model, 12)
+    is_short = found.returns["planner"] > 0
+    assert 0 < is_short.sum() < 12 and set(found.ages[is_short]) == {6}
+    assert set(found.ages) == {6} if delay == 6 else {6} < set(found.ages) <= {4, 5, 6}
+    trial.let_the_best_answer(model, 12)
+    if delay == 6:
+        assert model.policy.who_answers == "planner"
+    else:  # whoever answers at 6 begins
+        assert model.policy.who_answers == "planner" or model.policy.expert_ages.stop <= 6
+
+
+def test_ctrl_c_ends_the_trial_and_not_the_learning(monkeypatch, capsys):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(trial, "_play", interrupted)
+    model = make(env=pendulum(), planner_trial_episodes=2, planner_train_freq=50).learn(60)
+    assert model.policy.who_answers == "planner" and model._planner_trained_at == 60
+    assert "The trial was interrupted" in capsys.readouterr().out
+
+
+def test_a_planner_of_one_age_is_not_tried_at_others_and_no_second_one_is_trained():
+    with pytest.warns(UserWarning, match="No trial is played, and the planner answers: .*mask='fixed'"):
+        model = make(
+            env=pendulum(max_delay=4), planner_kwargs={"mask": "fixed", "present": None}, planner_trial_episodes=2
+        ).learn(60)
+    assert model.policy.who_answers == "planner"
+    ways = {"paper": {"mask": "fixed", "present": "inpainted"}}
+    assert masks_of(make(env=pendulum(delay=(0, 2)), planner_ways=ways).learn(60)) == ["random"]
+    assert masks_of(make(env=pendulum(), planner_ways=ways).learn(60)) == ["random", "fixed"]
+
+
+def test_without_delay_no_way_is_played_twice():
+    ways = {**OF_ONE_PLANNER, "own": {"temperature": 0.5}}
+    model = make(env=pendulum(delay=0), planner_ways=ways).learn(60)
+    names = [*trial.play_trial(model, 1).returns]
+    assert "default" in names and "inpainted" not in names and "actor" not in names
