@@ -6,6 +6,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields
+from difflib import get_close_matches
 from operator import itemgetter
 from typing import Any
 
@@ -283,7 +284,8 @@ def _as_float32(name: str, given: Any, space: spaces.Space[Any]) -> np.ndarray:
     if values.shape != space.shape and values.shape[1:] != space.shape:
         raise ValueError(
             f"{name} has the shape {values.shape}, expected {space.shape}, or (n_envs, *{space.shape}) for a batch; "
-            "the agent was built for another task or max_delay."
+            "the agent was built for another task, or for another largest delay, which "
+            "DelayedObservationWrapper(..., max_delay=...) gives."
         )
     if values.shape != space.shape and len(values) == 0:
         raise ValueError(f"{name} is an empty batch, of shape {values.shape}; there is nothing to answer.")
@@ -328,5 +330,7 @@ def settings_of(cls: Any, given: dict[str, Any] | None, whose: str) -> Any:
         raise ValueError(f'{whose}\'s settings are a dict, such as {{"{names[0]}": ...}}, got {given!r}.')
     given = given or {}
     if unknown := sorted(set(given) - set(names)):
-        raise ValueError(f"{whose} has no setting {', '.join(unknown)}; it has {', '.join(names)}.")
+        nearest = get_close_matches(unknown[0], names, n=1)
+        hint = f"did you mean {nearest[0]}?" if nearest else f"it has {', '.join(names)}."
+        raise ValueError(f"{whose} has no setting {', '.join(unknown)}; {hint}")
     return cls(**given)

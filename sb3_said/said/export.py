@@ -35,7 +35,10 @@ def to_onnx(model: SAID) -> Any:
         raise ImportError('onnx is missing, which export needs: pip install "sb3_said[export]"') from error
     policy, student = model.policy, model.policy.student
     if student is None:
-        raise ValueError("This agent has no student to export; call distill() first, and save it.")
+        raise ValueError(
+            "This agent has no student to export. In Python: model = SAID.load(file, env=env); model.distill(); "
+            "model.save(file)."
+        )
     state_space, space, max_delay = check_spaces(policy.observation_space, policy.action_space)
     obs_dim, act_dim = state_space.shape[0], space.shape[0]
     nodes: list[Any] = []

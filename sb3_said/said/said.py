@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import asdict, replace
+from collections.abc import Iterable
+from dataclasses import asdict, fields, replace
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -17,7 +18,7 @@ from sb3_said.files.archive import PathOrFile
 from sb3_said.files.arguments import from_data
 from sb3_said.offline import IQLConfig, OfflineAlgorithm
 from sb3_said.offline.learning import listed
-from sb3_said.planner.config import SAMPLING_SETTINGS, WEIGHT_SETTINGS
+from sb3_said.planner.config import SAMPLING_SETTINGS, WEIGHT_SETTINGS, PlannerConfig
 from sb3_said.sac import StableSAC
 from sb3_said.sac.policies import settings_of
 from sb3_said.said.callbacks import PlannerTrainingCallback
@@ -138,6 +139,16 @@ class SAID(PlannerLearner, StableSAC):
         own = {name: getattr(self, name) for name in ("planner_kwargs", "value", "iql_kwargs", "student_width")}
         return {**super()._policy_flags(), **own}
 
+    @classmethod
+    def _refuse_unknown(cls, given: Iterable[str], known: set[str]) -> None:
+        given = set(given)
+        if ours := sorted(given & {field.name for field in fields(PlannerConfig)} - known):
+            raise TypeError(
+                f"{', '.join(ours)}: of the planner, whose settings are planner_kwargs={{{ours[0]!r}: ...}}, on the "
+                f'command line -params "planner_kwargs:{{{ours[0]!r}: ...}}".'
+            )
+        super()._refuse_unknown(given, known)
+
     def _check_file(self, saved: dict[str, Any]) -> None:
         """Refuse a trained planner of other settings than this agent's, of which its weights mean something else."""
         super()._check_file(saved)
@@ -176,6 +187,12 @@ class SAID(PlannerLearner, StableSAC):
         A :class:`PlannerTrainingCallback` among the callbacks trains the planner, and otherwise one that is added. The
         expert answers all callbacks, such as ``EvalCallback``, also when the planner has been trained before.
         """
+        if self.policy.planner_is_trained and self.replay_buffer.size() == 0:
+            warnings.warn(
+                "The replay is empty, as after load(), so the planner that the file has will be replaced by one of the "
+                "new steps alone. load_replay_buffer() before learn() brings back what it learned from.",
+                stacklevel=2,
+            )
         # After the user's own it has nothing to do
         callbacks = [*listed(callback), PlannerTrainingCallback(progress_bar=progress_bar)]
         with self.policy.answering("expert"):

@@ -90,7 +90,9 @@ def find_agent(path: Path) -> tuple[Path, Record | None]:
     for name in names:
         if (path / name).is_file():
             return path / name, record
-    raise ValueError(f"{path} has no finished agent: none of {', '.join(names)}.")
+    raise ValueError(
+        f"{path} has no finished agent: none of {', '.join(names)}. sb3-said train --resume {path} goes on with it."
+    )
 
 
 def find_normalization(file: Path, record: Record | None) -> Path | None:

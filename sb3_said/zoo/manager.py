@@ -13,6 +13,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 from filelock import FileLock
 from rl_zoo3 import ALGOS, exp_manager
 from rl_zoo3.exp_manager import ExperimentManager
@@ -204,7 +205,7 @@ class DelayedExperimentManager(ExperimentManager):
         """
         is_new, made = self.lock is None, None
         try:
-            with ending_training(ValueError, TypeError, AssertionError, ImportError, OSError):
+            with ending_training(ValueError, TypeError, AssertionError, ImportError, OSError, gym.error.Error):
                 made = self._set_up()
                 return made
         finally:

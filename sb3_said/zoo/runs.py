@@ -6,6 +6,7 @@ import os
 import platform
 import shlex
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
@@ -121,6 +122,7 @@ def load_run(
     import_packages([*(record.gym_packages if record is not None else ()), *gym_packages])
 
     model = ALGORITHMS[algo][0].load(file, device=device)
+    _warn_if_unfinished(model, file, record)
     kwargs = {**(record.env_kwargs if record is not None else {}), **(env_kwargs or {})}
 
     def make_task() -> gym.Env[Any, Any]:
@@ -149,6 +151,16 @@ def load_run(
     is_normalized = bool(hyperparams.get("normalize")) or getattr(model, "reads_normalized", False)
     normalize = _load_normalize(file, record, make_env, is_normalized)
     return LoadedRun(model, make_env, normalize, file.parent, info, changes(kwargs, wrappers))
+
+
+def _warn_if_unfinished(model: BaseAlgorithm, file: Path, record: Record | None) -> None:
+    is_last = record is not None and file.name == record.agent_name  # and no better one of amid the training
+    if is_last and isinstance(model, SAID) and not model.policy.planner_is_trained:
+        warnings.warn(
+            f"This run stopped after {model.num_timesteps} steps, before its planner was trained: its expert plays. "
+            f"sb3-said train --resume {file.parent} goes on.",
+            stacklevel=3,
+        )
 
 
 def changes(env_kwargs: dict[str, Any], wrappers: list[Any]) -> dict[str, Any]:

@@ -200,4 +200,11 @@ def joined_settings(argv: list[str]) -> list[str]:
     for names in (("-params", "--hyperparams"), ("--env-kwargs",), ("--eval-env-kwargs",), ("--gym-packages",)):
         settings.add_argument(*names, dest=names[0], nargs="+", action="extend", default=[])
     given, rest = settings.parse_known_args(argv)
+    for name, words in vars(given).items():
+        for word in words if name != "--gym-packages" else []:
+            if ":" not in word:
+                raise ValueError(
+                    f"{name} takes NAME:VALUE, got {word!r}. A VALUE is Python, so that text has quotes of its own: "
+                    f"{name} \"policy:'MlpPolicy'\"."
+                )
     return [*rest, *(word for name, words in vars(given).items() if words for word in (name, *words))]

@@ -34,7 +34,7 @@ def changed(**parts):
         (changed(delay=np.array([0.5], np.float32)), r"whole numbers in 0\.\.2"),
         (changed(action_history=np.full((2, 1), 1.5, np.float32)), r"scaled to \[-1, 1\]"),
         (changed(observation=np.zeros(3, np.float32)), r"observation has the shape \(3,\), expected \(2,\)"),
-        (observation(delay=3), r"action_history has the shape \(3, 1\).*another task or max_delay"),
+        (observation(delay=3), r"action_history has the shape \(3, 1\).*another task, or for another largest delay"),
         (changed(delay=np.zeros((4, 1), np.float32)), "differ in how many"),
         ({"observation": np.zeros(2, np.float32)}, "DelayedObservationWrapper"),
         (changed(undelayed_observation=np.zeros(2, np.float32)), "undelayed_observation"),

@@ -157,7 +157,7 @@ def test_settings_that_cannot_be_changed_are_refused(saved, given, message):
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"planner_kwargs": {"dept": 2}}, "no setting dept; it has depth"),
+        ({"planner_kwargs": {"dept": 2}}, "no setting dept; did you mean depth"),
         ({"planner_kwargs": {"horizon": 1}}, "horizon is 1"),
         ({"planner_gradient_steps": 0}, "planner_gradient_steps must be a whole number, at least 1, got 0"),
         ({"planner_gradient_steps": 2.5}, "planner_gradient_steps must be a whole number, at least 1, got 2.5"),
@@ -178,7 +178,7 @@ def test_arguments_that_cannot_work_are_refused(kwargs, message):
 
 
 def test_an_unknown_setting_is_told_where_no_other_is_given():
-    with pytest.raises(ValueError, match="The planner has no setting dept; it has depth"):
+    with pytest.raises(ValueError, match="The planner has no setting dept; did you mean depth"):
         SAID("MlpPolicy", delayed(), planner_kwargs={"dept": 2}, buffer_size=100, device="cpu")
     with pytest.raises(ValueError, match=r"The planner's settings are a dict.* got PlannerConfig"):
         SAID("MlpPolicy", delayed(), planner_kwargs=PlannerConfig(), buffer_size=100, device="cpu")
@@ -203,6 +203,24 @@ def test_an_unknown_argument_is_told_the_nearest(cls, name, nearest):
         make(cls=cls, **{name: 1})
     with pytest.raises(TypeError, match=rf"^{cls.__name__} has no argument zzz; it has action_noise, "):
         make(cls=cls, zzz=1)
+
+
+def test_a_setting_of_the_planner_is_told_its_place():
+    with pytest.raises(TypeError, match=r"temperature: of the planner, .* planner_kwargs=\{'temperature':"):
+        make(temperature=0.5)
+    with pytest.raises(ValueError, match="no setting temprature; did you mean temperature"):
+        make(planner_kwargs={"temprature": 0.5})
+
+
+def test_who_learns_on_without_the_replay_is_told_that_the_planner_goes(saved, trained, tmp_path):
+    with pytest.warns(UserWarning, match="planner that the file has will be replaced"):
+        SAID.load(saved, env=delayed(), device="cpu").learn(30)
+    trained.save_replay_buffer(tmp_path / "replay")
+    loaded = SAID.load(saved, env=delayed(), device="cpu")
+    loaded.load_replay_buffer(tmp_path / "replay")
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*will be replaced")
+        loaded.learn(30)
 
 
 def test_every_argument_has_a_default_and_is_an_attribute():

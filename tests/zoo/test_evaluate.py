@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -239,6 +240,19 @@ def test_logs_that_a_kill_has_cut_are_drawn_as_far_as_they_go(tmp_path: Path) ->
     np.testing.assert_array_equal(episodes.get_xydata(), [[12, 5], [25, 7]])
 
 
+def test_a_run_that_stopped_before_its_planner_says_so(tmp_path: Path) -> None:
+    folder = write_run(tmp_path, SAID, 2)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*stopped after")
+        model = load_run(folder).model
+    model.policy.planner_updates.zero_()
+    model.save(folder / f"{ENV}.zip")
+    with pytest.warns(
+        UserWarning, match=f"stopped after 60 steps, before its planner .*train --resume {folder} goes on"
+    ):
+        load_run(folder)
+
+
 def test_paths_that_hold_no_agent(run: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="does not exist"):
         load_run(tmp_path / "nowhere")
@@ -247,7 +261,7 @@ def test_paths_that_hold_no_agent(run: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"holds no run: .*run.json is missing"):
         load_run(tmp_path)
     Record("said", ENV).write(tmp_path)
-    with pytest.raises(ValueError, match="no finished agent"):
+    with pytest.raises(ValueError, match=r"no finished agent.*train --resume .* goes on with it"):
         load_run(tmp_path)
 
 

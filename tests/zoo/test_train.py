@@ -17,6 +17,7 @@ import yaml
 
 pytest.importorskip("rl_zoo3")
 
+import gymnasium as gym
 from kill import Killed
 from stable_baselines3.common.callbacks import EvalCallback
 from trained_run import NETWORKS, train_here
@@ -28,6 +29,7 @@ from sb3_said.files.checkpoint import TrainingCheckpointCallback
 from sb3_said.zoo import manager, train
 from sb3_said.zoo.arguments import Delay
 from sb3_said.zoo.folder import log_suffix
+from sb3_said.zoo.manager import DelayedExperimentManager
 from sb3_said.zoo.record import Record
 from sb3_said.zoo.runs import load_run
 
@@ -300,7 +302,7 @@ def test_the_expert_can_learn_under_another_delay(tmp_path: Path, monkeypatch: p
         ages.extend(ages_of(like.eval_env))
 
     monkeypatch.setattr(manager, "evaluate_answer", told)
-    monkeypatch.setattr("sb3_said.said.said.let_the_best_answer", None)  # the expert's delay would tell of another
+    monkeypatch.setattr("sb3_said.said.learning.let_the_best_answer", None)  # the expert's delay would tell of another
     params = ["-params", "planner_gradient_steps:5", TINY_PLANNER, NETWORKS]
     train_here(tmp_path, command, "--eval-freq", "400", *params)
     assert ages == [0, 1, 2, 3]
@@ -354,7 +356,8 @@ def test_says_what_is_wrong(words: str, message: str, tmp_path: Path, capsys: py
     ("words", "message"),
     [
         ("-params gama:0.9", "has no argument gama; did you mean gamma"),
-        ("-params planner_kwargs:dict(deepth=3)", "The planner has no setting deepth"),
+        ("-params planner_kwargs:dict(deepth=3)", "The planner has no setting deepth; did you mean depth"),
+        ("-params temperature:0", "temperature: of the planner, .*planner_kwargs:{'temperature'"),
         ("--delay 2 -params normalize:True", "norm_obs_keys"),
         ("--env CartPole-v1", "action space"),
         ("--algo sadr -params planner_gradient_steps:3", "has no argument planner_gradient_steps"),
@@ -485,6 +488,20 @@ def test_a_resume_from_another_folder_goes_on_with_the_same_curve(
 )
 def test_settings_given_twice_are_joined(given: str, read: str) -> None:
     assert train.joined_settings(given.split()) == read.split()
+
+
+def test_a_setting_without_a_value_is_refused_with_its_form() -> None:
+    with pytest.raises(ValueError, match=r"-params takes NAME:VALUE, got 'gamma=0.9'.*policy:'MlpPolicy'"):
+        train.joined_settings(["-params", "gamma=0.9"])
+
+
+def test_a_task_whose_library_is_missing_ends_in_one_line(monkeypatch, tmp_path: Path) -> None:
+    def missing(*_: object, **__: object) -> None:
+        raise gym.error.DependencyNotInstalled("Box2D is not installed")
+
+    monkeypatch.setattr(DelayedExperimentManager, "create_envs", missing)
+    with pytest.raises(SystemExit, match="error: Box2D is not installed"):
+        train.main(["--env", "Pendulum-v1", "-f", str(tmp_path), "--verbose", "0"])
 
 
 def test_no_log_is_overwritten(tmp_path: Path) -> None:
