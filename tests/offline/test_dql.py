@@ -284,7 +284,7 @@ def test_arguments_of_another_actor_and_other_critics_are_refused(given):
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ({"n_steps": 5}, "DQL has no setting n_steps; it has denoising_steps"),
+        ({"n_steps": 5}, "DQL has no setting n_steps; did you mean denoising_steps"),
         ({"n_candidates": 0}, "n_candidates is 0, expected at least 1"),
         ({"beta_max": 0.01}, "0 < beta_min < beta_max"),
         ({"time_embedding": 7}, "expected an even number"),
