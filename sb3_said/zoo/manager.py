@@ -26,6 +26,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from sb3_said import SAID, DelayedSAC, PlannerTrainingCallback, StableSAC
 from sb3_said.files.archive import SavedFileError
 from sb3_said.files.arguments import with_given
+from sb3_said.files.atomic import write_json
 from sb3_said.files.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback, restore_training
 from sb3_said.files.normalization import load_normalization, normalization_file, save_normalization
 from sb3_said.offline import BC, DQL, OfflineAlgorithm
@@ -41,7 +42,7 @@ from sb3_said.zoo.folder import (
     log_suffix,
 )
 from sb3_said.zoo.presets import config_file, preset_overrides
-from sb3_said.zoo.record import EVALUATED, GIVEN_NAME, Record, make_wrapper, options_of, with_delay
+from sb3_said.zoo.record import ENDED_NAME, EVALUATED, GIVEN_NAME, Record, make_wrapper, options_of, with_delay
 from sb3_said.zoo.stopping import Stopping, shielded
 
 LONGEST_NAME = 100  # of what a folder says of delays and logs; file systems end at 255
@@ -322,6 +323,7 @@ class DelayedExperimentManager(ExperimentManager):
         :raises SystemExit: for a checkpoint that is damaged, or of another training
         """
         resumes = self.checkpoint.exists()
+        (self.folder / ENDED_NAME).unlink(missing_ok=True)
         if resumes:
             with ending_training(SavedFileError):
                 callbacks = CallbackList(self.callbacks)
@@ -381,6 +383,8 @@ class DelayedExperimentManager(ExperimentManager):
         save_with_normalization(model, file)
         if self.save_replay_buffer:
             model.save_replay_buffer(self.folder / "replay_buffer.pkl")
+        if not self.stopping.is_asked:
+            write_json(self.folder / ENDED_NAME, {"trained_steps": model.num_timesteps})
         if (vec_normalize := model.get_vec_normalize_env()) is not None:
             vec_normalize.save(str(Path(self.params_path, "vecnormalize.pkl")))  # for rl_zoo3's own tools
 

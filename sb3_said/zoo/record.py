@@ -25,6 +25,7 @@ from sb3_said.files.atomic import write_text
 from sb3_said.zoo.arguments import Delay, largest_delay
 
 RECORD_NAME = "run.json"
+ENDED_NAME = "ended.json"  # of a training that was not interrupted
 GIVEN_NAME = "given.zip"  # the agent that a run began with (-i): it may be moved, or written over, before a resume
 WRAPPER = "sb3_said.delays.DelayedObservationWrapper"
 

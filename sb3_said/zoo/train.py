@@ -19,7 +19,7 @@ from sb3_said.zoo.folder import TUNED_SETTINGS
 from sb3_said.zoo.manager import ALGORITHMS, ALGOS, DelayedExperimentManager, Run
 from sb3_said.zoo.offline import OfflineExperimentManager
 from sb3_said.zoo.presets import PRESETS
-from sb3_said.zoo.record import Record
+from sb3_said.zoo.record import ENDED_NAME, Record
 
 EXAMPLES = """
 examples:
@@ -98,8 +98,15 @@ def own_parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> None:
     """Train as the command line says; exit with 130 when a signal has ended it."""
     parser = own_parser()
+    argv = sys.argv[1:] if argv is None else argv
     with explained(parser):
-        run, algo, zoo_argv = read_command_line(sys.argv[1:] if argv is None else argv)
+        run, algo, zoo_argv = read_command_line(argv)
+    if run.resume is not None and len(argv) <= 2 and (run.resume / ENDED_NAME).is_file():  # nothing else is asked for
+        print(
+            f"{run.resume} has ended, and nothing is left to do. sb3-said evaluate {run.resume} plays its agent. With "
+            "-n STEPS, or another setting, --resume trains it for longer."
+        )
+        return
     if "--help" in zoo_argv:
         parser.print_help()
     made: list[DelayedExperimentManager] = []

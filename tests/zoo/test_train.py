@@ -30,7 +30,7 @@ from sb3_said.zoo import manager, train
 from sb3_said.zoo.arguments import Delay
 from sb3_said.zoo.folder import log_suffix
 from sb3_said.zoo.manager import DelayedExperimentManager
-from sb3_said.zoo.record import Record
+from sb3_said.zoo.record import ENDED_NAME, Record
 from sb3_said.zoo.runs import load_run
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
@@ -80,10 +80,19 @@ def test_a_run_leaves_an_agent_that_answers_with_its_planner(finished: Path) -> 
     assert "planner/present_error_mlp_d2" in header and "planner/action_error_d2" in header
 
 
-def test_a_finished_run_resumes_to_the_same_agent(finished: Path, tmp_path: Path) -> None:
+def test_a_finished_run_has_nothing_left_to_do_and_else_resumes_to_the_same_agent(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     copy = Path(shutil.copytree(finished, tmp_path / "copy"))
+    before = {file: file.stat().st_mtime_ns for file in copy.rglob("*")}
+    train.main(["--resume", str(copy)])
+    assert f"{copy} has ended, and nothing is left to do" in capsys.readouterr().out
+    assert {file: file.stat().st_mtime_ns for file in copy.rglob("*")} == before
+    (copy / ENDED_NAME).unlink()  # as of one that was killed after its last checkpoint
     train.main(["--resume", str(copy)])
     assert_same_agents(finished, copy)
+    assert (copy / ENDED_NAME).is_file()
+    (copy / ENDED_NAME).unlink()
     (copy / "checkpoint.zip").write_bytes(b"half of one")
     with pytest.raises(SystemExit, match=r"train: error: Cannot load .*checkpoint\.zip': the file is damaged"):
         train.main(["--resume", str(copy)])
