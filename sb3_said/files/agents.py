@@ -9,7 +9,6 @@ import os
 import pathlib
 import warnings
 from collections.abc import Iterable
-from difflib import get_close_matches
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -21,7 +20,15 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import ConstantSchedule, get_device, get_system_info
 
 from sb3_said.files.archive import PathOrFile, SavedFileError, load_metadata, load_tree, readable, save_tree
-from sb3_said.files.arguments import as_data, check_noise, from_data, space_as_data, space_from_data, with_given
+from sb3_said.files.arguments import (
+    as_data,
+    check_noise,
+    from_data,
+    instead_of,
+    space_as_data,
+    space_from_data,
+    with_given,
+)
 from sb3_said.files.checks import (
     check_argument,
     check_names,
@@ -225,9 +232,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
         """:raises TypeError: for an argument that is none of those known, with the nearest name of all there are"""
         for unknown in sorted(set(given) - known):
             names = sorted((cls._argument_names() | {"device", "tensorboard_log"}) - {"policy_class"})
-            nearest = get_close_matches(unknown, names, n=1)
-            hint = f"did you mean {nearest[0]}?" if nearest else f"it has {', '.join(names)}."
-            raise TypeError(f"{cls.__name__} has no argument {unknown}; {hint}")
+            raise TypeError(f"{cls.__name__} has no argument {unknown}; {instead_of(unknown, names)}")
 
     def _check_file(self, saved: dict[str, Any]) -> None:
         """Look at a file whose parameters are about to be taken over; an algorithm may refuse it.

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from difflib import get_close_matches
 from numbers import Real
 from typing import Any
 
@@ -66,6 +67,12 @@ def as_data(value: Any, where: str) -> Any:
     if isinstance(value, type) and value in _NAMES:
         return {"@": [_NAMES[value]]}
     raise ValueError(f"{where} is {value!r:.100}, which cannot be written without pickle.")
+
+
+def instead_of(unknown: str, names: Sequence[str]) -> str:
+    """Return how an error about an unknown name ends: with the nearest of the names that there are, or all of them."""
+    nearest = get_close_matches(unknown, names, n=1)
+    return f"did you mean {nearest[0]}?" if nearest else f"it has {', '.join(names)}."
 
 
 def from_data(node: Any) -> Any:

@@ -6,7 +6,6 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields
-from difflib import get_close_matches
 from operator import itemgetter
 from typing import Any
 
@@ -23,6 +22,7 @@ from torch import nn
 
 from sb3_said.delays.space import UNDELAYED, check_spaces
 from sb3_said.files.agents import SafePolicyMixin
+from sb3_said.files.arguments import instead_of
 from sb3_said.sac.extractors import KeyExtractor, NormalizedExtractor, StateAugmentedExtractor
 from sb3_said.sac.scaling import ReturnScale, StateNormalizer
 
@@ -330,7 +330,5 @@ def settings_of(cls: Any, given: dict[str, Any] | None, whose: str) -> Any:
         raise ValueError(f'{whose}\'s settings are a dict, such as {{"{names[0]}": ...}}, got {given!r}.')
     given = given or {}
     if unknown := sorted(set(given) - set(names)):
-        nearest = get_close_matches(unknown[0], names, n=1)
-        hint = f"did you mean {nearest[0]}?" if nearest else f"it has {', '.join(names)}."
-        raise ValueError(f"{whose} has no setting {', '.join(unknown)}; {hint}")
+        raise ValueError(f"{whose} has no setting {', '.join(unknown)}; {instead_of(unknown[0], names)}")
     return cls(**given)

@@ -150,7 +150,7 @@ class PlannerLearner(OfflineAlgorithm):
             raise KeyboardInterrupt
         self._planner_trained_at = self.num_timesteps
 
-    def learn_offline(  # type: ignore[override]
+    def learn_offline(  # type: ignore[override]  # the planner has its own number of updates, logs and checkpoints
         self: SelfLearner,
         dataset: Any,
         gradient_steps: int | None = None,

@@ -18,7 +18,6 @@ from sb3_said.offline.iql import IQL
 from sb3_said.planner.checks import check_same
 from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.trainer import PlannerTrainer, worse_than_regression
-from sb3_said.sac.policies import settings_of
 
 PLANNER_CHECKPOINT_NAME = "planner_checkpoint.zip"
 SECOND_CHECKPOINT_NAME = "planner_{mask}_checkpoint.zip"  # of one of another mask than the agent was made with
@@ -56,7 +55,7 @@ class PlannerTraining:
         mask = trainer.config.mask
         self.name = "planner" if self.is_agents else f"planner of mask={mask!r}"
         # By mask, as a trial may have made the other planner the agent's own
-        first = settings_of(PlannerConfig, model._given_planner_kwargs, "The planner").mask
+        first = model._given_planner_kwargs.get("mask", PlannerConfig.mask)
         file = PLANNER_CHECKPOINT_NAME if mask == first else SECOND_CHECKPOINT_NAME.format(mask=mask)
         self._clock = None if folder is None else CheckpointClock(Path(folder) / file)
         self.watcher = watcher

@@ -383,10 +383,10 @@ class DelayedExperimentManager(ExperimentManager):
         save_with_normalization(model, file)
         if self.save_replay_buffer:
             model.save_replay_buffer(self.folder / "replay_buffer.pkl")
-        if not self.stopping.is_asked:
-            write_json(self.folder / ENDED_NAME, {"trained_steps": model.num_timesteps})
         if (vec_normalize := model.get_vec_normalize_env()) is not None:
             vec_normalize.save(str(Path(self.params_path, "vecnormalize.pkl")))  # for rl_zoo3's own tools
+        if not self.stopping.is_asked:
+            write_json(self.folder / ENDED_NAME, {"trained_steps": model.num_timesteps})
 
     def _logger(self, steps: int) -> Logger:
         """Log to the screen, to progress.csv (one file per resume) and to TensorBoard if asked for.

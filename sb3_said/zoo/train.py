@@ -202,16 +202,18 @@ def joined_settings(argv: list[str]) -> list[str]:
 
     rl_zoo3 reads only the last use of an option, so a resume that changes one setting would drop the others. Of a key
     given twice, it takes the later value.
+
+    :raises ValueError: for a word without a colon
     """
     settings = argparse.ArgumentParser(add_help=False, allow_abbrev=False)  # "--env" is not short for "--env-kwargs"
     for names in (("-params", "--hyperparams"), ("--env-kwargs",), ("--eval-env-kwargs",), ("--gym-packages",)):
         settings.add_argument(*names, dest=names[0], nargs="+", action="extend", default=[])
     given, rest = settings.parse_known_args(argv)
-    for name, words in vars(given).items():
-        for word in words if name != "--gym-packages" else []:
-            if ":" not in word:
-                raise ValueError(
-                    f"{name} takes NAME:VALUE, got {word!r}. A VALUE is Python, so that text has quotes of its own: "
-                    f"{name} \"policy:'MlpPolicy'\"."
-                )
+    pairs = [(name, word) for name, words in vars(given).items() if name != "--gym-packages" for word in words]
+    for name, word in pairs:
+        if ":" not in word:
+            raise ValueError(
+                f"{name} takes NAME:VALUE, got {word!r}. A VALUE is Python, so that text has quotes of its own: "
+                f"{name} \"policy:'MlpPolicy'\"."
+            )
     return [*rest, *(word for name, words in vars(given).items() if words for word in (name, *words))]
