@@ -17,6 +17,7 @@ import torch as th
 
 pytest.importorskip("rl_zoo3")
 
+from drawing import need_a_renderer
 from small_run import ENV, TINY_PLANNER, write_run
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
@@ -377,15 +378,7 @@ def test_enjoy_draws_an_mp4(run: Path, tmp_path: Path, monkeypatch: pytest.Monke
                             capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
     imageio = pytest.importorskip("imageio")
     pytest.importorskip("imageio_ffmpeg")
-    monkeypatch.setenv("MUJOCO_GL", os.environ.get("MUJOCO_GL", "egl"))
-    env = gym.make(ENV, render_mode="rgb_array")
-    env.reset()
-    try:
-        env.render()
-    except Exception as error:  # each graphics library fails in its own way
-        pytest.skip(f"nothing can be drawn here: {error!r}")
-    finally:
-        env.close()
+    need_a_renderer(ENV, monkeypatch)
     film = tmp_path / "film.mp4"
     enjoy.main([str(run), "--record", str(film), "--answer", "expert", "--device", "cpu"])
     with imageio.get_reader(film) as reader:
