@@ -23,6 +23,7 @@ from torch import nn
 from sb3_said.delays.space import UNDELAYED, check_spaces
 from sb3_said.files.agents import SafePolicyMixin
 from sb3_said.files.arguments import instead_of
+from sb3_said.sac.episodes import TrainingEpisodes
 from sb3_said.sac.extractors import KeyExtractor, NormalizedExtractor, StateAugmentedExtractor
 from sb3_said.sac.scaling import ReturnScale, StateNormalizer
 
@@ -91,7 +92,9 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
             self.actor_kwargs["observation_space"] = self.critic_kwargs["observation_space"] = self.replay_space
         super()._build(lr_schedule)
         self.averaged_actor: Actor | None = None
+        self.training_episodes: TrainingEpisodes | None = None
         if self.average_actor:
+            self.training_episodes = TrainingEpisodes()
             self.averaged_actor = self.make_actor().requires_grad_(False)
             self.averaged_actor.load_state_dict(self.actor.state_dict())
             self.averaged_actor.set_training_mode(False)

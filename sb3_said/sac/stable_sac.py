@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import polyak_update
 
 from sb3_said.delays.space import UNDELAYED
@@ -28,7 +29,8 @@ class StableSAC(DelayedSAC):
     - in those units the entropy coefficient starts at 0.01, and the target is half of SAC's;
     - actor and entropy coefficient are updated every second step (TD3, https://arxiv.org/abs/1802.09477, section 5.2);
     - a running average of the actor's weights answers ``predict``, and is saved with it, while the actor itself
-      collects: one gradient step can move a return far (https://arxiv.org/abs/2309.14597), thousands of them less.
+      collects: one gradient step can move a return far (https://arxiv.org/abs/2309.14597), thousands of them less. It
+      waits while the training episodes have lost half of what was learned (like TD7's checkpoints, sac/episodes.py).
 
     With ``scale_rewards=False, normalise_states=False, policy_delay=1, actor_averaging=0.0, ent_coef="auto",
     target_entropy="auto"`` it is ``DelayedSAC``, but for the order of an update, where the critics come first.
@@ -98,6 +100,33 @@ class StableSAC(DelayedSAC):
             "critic_layer_norm": self.critic_layer_norm,
         }
 
+    def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:
+        """Let an agent of a file from before they were counted know nothing of its training episodes."""
+        params = super()._adapt_parameters(params)
+        given = params.get("policy", {})
+        if any(name.startswith("averaged_actor.") for name in given):
+            unknown = {name: x for name, x in self.policy.state_dict().items() if name.startswith("training_episodes.")}
+            params = {**params, "policy": {**unknown, **given}}
+        return params
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        *args: Any,
+        **kwargs: Any,
+    ) -> tuple[int, BaseCallback]:
+        if reset_num_timesteps and self.policy.training_episodes is not None:
+            self.policy.training_episodes.forget()  # another task may return less from now on
+        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
+
+    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
+        super()._update_info_buffer(infos, dones)
+        if self.policy.training_episodes is not None:
+            for ended in (info["episode"] for info in infos if info.get("episode") is not None):
+                self.policy.training_episodes.add(float(ended["r"]), int(ended["l"]))
+
     def _sample_action(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, np.ndarray]:
         with self.policy.without_average():
             return super()._sample_action(*args, **kwargs)
@@ -137,14 +166,18 @@ class StableSAC(DelayedSAC):
 
     def _average_actor(self) -> None:
         """Move the average towards the actor; of the first updates it is the plain mean."""
-        if self.policy.averaged_actor is not None:
-            n = self._n_updates // self.policy_delay
-            decay = min(self.actor_averaging, 1.0 - 1.0 / n)
-            polyak_update(self.actor.parameters(), self.policy.averaged_actor.parameters(), 1.0 - decay)
-            for own, averaged in zip(self.actor.buffers(), self.policy.averaged_actor.buffers(), strict=True):
-                averaged.copy_(own)  # of a batch norm
-            if self.use_sde:
-                self.policy.averaged_actor.reset_noise()  # of the spread that it has learned by now
+        average, episodes = self.policy.averaged_actor, self.policy.training_episodes
+        if average is None or episodes is None:
+            return
+        n = self._n_updates // self.policy_delay
+        decay = min(self.actor_averaging, 1.0 - 1.0 / n)
+        if decay == self.actor_averaging and episodes.have_collapsed:
+            return
+        polyak_update(self.actor.parameters(), average.parameters(), 1.0 - decay)
+        for own, averaged in zip(self.actor.buffers(), average.buffers(), strict=True):
+            averaged.copy_(own)  # of a batch norm
+        if self.use_sde:
+            average.reset_noise()  # of the spread that it has learned by now
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Update critics, and every ``policy_delay`` steps actor and entropy coefficient, on batches from replay."""
@@ -204,6 +237,8 @@ class StableSAC(DelayedSAC):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/ent_coef", float(self._ent_coef()))
         self.logger.record("train/reward_scale", float(scale))
+        if self.policy.training_episodes is not None:
+            self.logger.record("train/average_waits", float(self.policy.training_episodes.have_collapsed))
         for name, values in losses.items():
             if values:
                 self.logger.record(f"train/{name}", float(np.mean(values)))

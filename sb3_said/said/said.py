@@ -163,6 +163,7 @@ class SAID(PlannerLearner, StableSAC):
 
     def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:
         """Keep this agent's own planner where the given one was never trained and has other settings."""
+        params = super()._adapt_parameters(params)
         given, own = params.get("policy", {}), self.policy.state_dict()
         shapes = [
             {name: value.shape for name, value in state.items() if name.startswith("planner.")}

@@ -1,0 +1,58 @@
+"""What the episodes of a training return: whether they still show what was learned."""
+
+from __future__ import annotations
+
+import torch as th
+
+from sb3_said.sac.scaling import OnTheHost
+
+N_EPISODES = 10  # whose mean is looked at
+LOST = 0.5  # of what was learned: by hindsight on four runs, results/stable_expert.md
+FORGETS = 100_000  # environment steps in which the best is forgotten, where no episode returns as much any more
+
+
+class TrainingEpisodes(OnTheHost):
+    """Tells when a policy that had learned has lost half of it, by its training episodes and by nothing else.
+
+    A return can collapse within ten episodes, after a hundred thousand steps of none that was bad
+    (results/stable_expert.md). TD7 (https://arxiv.org/abs/2306.02451, "Policy Checkpoints") keeps a policy by the worst
+    of its training episodes for that. Here the mean of the last ten is compared with that of the first ten and the best
+    so far, so rewards may have any sign and size.
+    """
+
+    newest: th.Tensor  # (N_EPISODES,) returns, the latest last
+    count: th.Tensor
+    first: th.Tensor
+    best: th.Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("newest", th.zeros(N_EPISODES, dtype=th.float64))
+        for name in ("count", "first", "best"):
+            self.register_buffer(name, th.zeros((), dtype=th.float64))
+
+    def add(self, episode_return: float, n_steps: int) -> None:
+        """Count an episode that has ended.
+
+        :param n_steps: its length, in environment steps
+        """
+        self.newest.copy_(th.cat([self.newest[1:], self.newest.new_tensor([episode_return])]))
+        self.count.add_(1.0)
+        mean = self.newest.mean()
+        if self.count == N_EPISODES:
+            self.first.copy_(mean)
+            self.best.copy_(mean)
+        elif self.count > N_EPISODES:
+            forgotten = self.best + (mean - self.best) * min(1.0, n_steps / FORGETS)
+            self.best.copy_(th.maximum(mean, forgotten))
+
+    @property
+    def have_collapsed(self) -> bool:
+        """Whether the last ten episodes return less than half of what was learned since the first ten."""
+        learned = float(self.best - self.first)
+        return bool(self.count > N_EPISODES) and float(self.newest.mean() - self.first) < (1.0 - LOST) * learned
+
+    def forget(self) -> None:
+        """Begin anew, as another training does."""
+        for value in self.buffers():
+            value.zero_()

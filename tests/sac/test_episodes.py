@@ -1,0 +1,102 @@
+"""Training episodes that have lost what was learned, and the average of StableSAC's actor, which waits for them."""
+
+import numpy as np
+import pytest
+import torch as th
+from hypothesis import given
+from hypothesis import strategies as st
+from small_agent import make
+from small_task import Drift, delayed
+
+from sb3_said import SAID, StableSAC
+from sb3_said.sac.episodes import FORGETS, N_EPISODES, TrainingEpisodes
+
+LEARNED, LOST, HELD = [0.0] * 10 + [100.0] * 10, [0.0] * 6, [0.0] * 4
+
+
+def after(returns, n_steps=0):
+    episodes = TrainingEpisodes()
+    for each in returns:
+        episodes.add(each, n_steps)
+    return episodes
+
+
+@given(st.lists(st.integers(-1000, 1000), max_size=40), st.integers(-3000, 3000), st.sampled_from([0.25, 1.0, 8.0]))
+def test_half_of_what_was_learned(returns, offset, scale):
+    """Where nothing is forgotten: means of ten against the first and the best, in rewards of any sign and unit."""
+    means = [np.mean(returns[i : i + 10]) for i in range(len(returns) - 9)]
+    expected = len(means) > 1 and means[-1] - means[0] < 0.5 * (max(means) - means[0]) - 1e-9
+    near = len(means) > 1 and abs(means[-1] - means[0] - 0.5 * (max(means) - means[0])) < 1e-9
+    found = after([scale * x + offset for x in returns]).have_collapsed
+    assert near or found == expected
+
+
+def test_a_collapse_is_told_within_ten_episodes_and_its_end_too():
+    assert not after(LEARNED + HELD).have_collapsed  # 60 of 100
+    assert after(LEARNED + LOST).have_collapsed  # 40
+    assert not after(LEARNED + LOST + [100.0] * 7).have_collapsed
+
+
+def test_the_best_is_forgotten_where_nothing_returns_as_much_any_more():
+    steps, episodes = 1000, after(LEARNED)
+    n = 0
+    while n < 10 or episodes.have_collapsed:
+        episodes.add(20.0, steps)
+        n += 1
+    # best - 20 decays from 80 by a factor of 1 - steps / FORGETS an episode, and 20 is half of 40
+    assert n == pytest.approx(np.log(80 / 20) / -np.log(1 - steps / FORGETS), abs=10)
+    episodes.forget()
+    assert not any(value.any() for value in episodes.buffers())
+
+
+def test_training_counts_the_episodes_that_end():
+    model = make(Drift(length=7), cls=StableSAC).learn(90)
+    episodes = model.policy.training_episodes
+    returns = [info["r"] for info in model.ep_info_buffer]
+    assert episodes.count == len(returns) == 12
+    np.testing.assert_array_equal(episodes.newest, returns[-N_EPISODES:])
+    assert episodes.first == pytest.approx(np.mean(returns[:10]))
+
+
+@pytest.mark.parametrize(("decay", "waits"), [(0.5, True), (0.999, False)])
+def test_the_average_waits_once_it_is_more_than_a_plain_mean(decay, waits):
+    model = make(Drift(), cls=StableSAC, actor_averaging=decay, policy_delay=1, learning_starts=1000).learn(30)
+    weight = model.policy.averaged_actor.mu.weight
+
+    def moves() -> bool:
+        before = weight.clone()
+        model.train(1, 16)
+        return not th.equal(weight, before)
+
+    model.train(3, 16)
+    model.policy.training_episodes.load_state_dict(after(LEARNED + LOST).state_dict())
+    assert moves() != waits
+    assert model.logger.name_to_value["train/average_waits"] == 1.0
+    model.policy.training_episodes.load_state_dict(after(LEARNED + HELD).state_dict())
+    assert moves()
+    assert model.logger.name_to_value["train/average_waits"] == 0.0
+
+
+def test_it_is_part_of_a_training_and_not_of_the_next(tmp_path):
+    model = make(delayed(2), cls=SAID).learn(60)
+    model.policy.training_episodes.load_state_dict(after(LEARNED + LOST).state_dict())
+    model.save(tmp_path / "agent.zip")
+    loaded = SAID.load(tmp_path / "agent.zip", env=delayed(2), device="cpu")
+    assert loaded.policy.training_episodes.have_collapsed
+    loaded.learn(1, reset_num_timesteps=False)
+    assert loaded.policy.training_episodes.have_collapsed
+    loaded.learn(1)
+    assert loaded.policy.training_episodes.count == 0
+
+
+def test_an_agent_of_before_they_were_counted_is_taken_over():
+    model, other = make(delayed(2), cls=SAID).learn(60), make(delayed(2), cls=SAID)
+    given = model.get_parameters()
+    given["policy"] = {name: x for name, x in given["policy"].items() if not name.startswith("training_episodes.")}
+    other.set_parameters(given)
+    th.testing.assert_close(other.actor.state_dict(), model.actor.state_dict())
+    assert other.policy.training_episodes.count == 0
+
+
+def test_without_an_average_nothing_is_counted():
+    assert make(Drift(), cls=StableSAC, actor_averaging=0.0).learn(30).policy.training_episodes is None
