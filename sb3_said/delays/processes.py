@@ -213,12 +213,17 @@ def in_steps(milliseconds: float | np.ndarray, control_period: float) -> int | n
     return int(steps) if steps.ndim == 0 else steps
 
 
-def as_process(delay: Delay) -> DelayProcess:
-    """Make a process of a number or a pair; return a process as it is.
+def as_process(delay: Delay | str) -> DelayProcess:
+    """Turn what a user writes as ``delay`` into a process.
 
-    :param delay: an integer (fixed), a ``(low, high)`` pair (drawn anew each episode), or a process
+    :param delay: an integer (fixed), a ``(low, high)`` pair (drawn anew each episode), a process, or any of these as
+        text (:func:`~sb3_said.delays.text.parse_process`)
     :raises ValueError: for anything else
     """
+    if isinstance(delay, str):
+        from sb3_said.delays.text import parse_process  # which names the processes of this module
+
+        delay = parse_process(delay)
     if _is_integer(delay):
         return FixedDelay(delay)  # type: ignore[arg-type]  # an integer, which mypy does not follow
     if isinstance(delay, (tuple, list)) and len(delay) == 2 and all(map(_is_integer, delay)):

@@ -112,8 +112,9 @@ def rollout(
                 if on_step is not None:
                     on_step(e)
                 if terminated or truncated:
-                    if "episode" in info:  # of a Monitor below wrappers that change rewards, as in training
-                        returns[episode] = info["episode"]["r"]
+                    monitored = info.get("episode")  # below wrappers that change rewards, as in training
+                    if isinstance(monitored, dict) and "r" in monitored:
+                        returns[episode] = monitored["r"]
                     if on_episode is not None:
                         on_episode(episode, float(returns[episode]), int(lengths[episode]))
                     if next_episode == n_episodes:

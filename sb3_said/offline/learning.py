@@ -100,6 +100,7 @@ class OfflineAlgorithm(DelayedSAC):
                 self.logger.dump(self.num_timesteps)
             if not self._goes_on(watcher):
                 break
+            watcher.on_rollout_end()
         if log_interval is not None and self.logger.name_to_value:  # since the last row
             self.logger.dump(self.num_timesteps)
         watcher.on_training_end()

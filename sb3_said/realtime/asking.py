@@ -65,7 +65,16 @@ class Asking:
 
 
 def plan_of(model: Any, observation: Any, deterministic: bool) -> np.ndarray:
-    """Return a plan for each observation of a batch: (B, K, act_dim), of one action where a model does not plan."""
+    """Return a plan for each observation of a batch: (B, K, act_dim), of one action where a model does not plan.
+
+    :raises ValueError: for a model with a memory, whose answer depends on the answers before
+    """
     if hasattr(model, "predict_plan"):
         return np.asarray(model.predict_plan(observation, deterministic=deterministic))
-    return np.asarray(model.predict(observation, deterministic=deterministic)[0])[:, None]
+    action, memory = model.predict(observation, deterministic=deterministic)
+    if memory is not None:
+        raise ValueError(
+            f"{type(model).__name__} answers with a memory, of type {type(memory).__name__}, which is not kept between "
+            "answers that may come late or never: give a model without one, such as one that reads the actions sent."
+        )
+    return np.asarray(action)[:, None]

@@ -136,6 +136,15 @@ class Ledger:
         self.observation, self._n_shown, self._is_stamped = state, n_executed, capture_time is not None
         return True
 
+    def turn_back(self, now: float, expected: float) -> None:
+        """Go on with a clock that went back: what was sent took effect as long ago as it had.
+
+        :param now: in the new time
+        :param expected: what this moment would be in the time before; NaN before the first action
+        """
+        self.captured = now
+        self._effects = deque((effect + now - expected for effect in self._effects), self._effects.maxlen)
+
     def request(self, n_steps: int) -> Request | None:
         """Return what to ask for the action to send in ``n_steps`` steps; None where no observation is young enough.
 

@@ -41,7 +41,8 @@ class ControlLoop:
     Python runs one thread at a time. Where ``act`` must not wait for the few milliseconds that a model computes in
     Python, give the model a process of its own: :class:`~sb3_said.realtime.ModelProcess`.
 
-    :param model: anything with ``predict``, ``observation_space`` and ``action_space`` of Stable-Baselines3
+    :param model: anything with ``predict``, ``observation_space`` and ``action_space`` of Stable-Baselines3, and without
+        a memory between its answers
     :param period: of ``act``, in seconds; with ``simulate`` in the unit of ``now``
     :param answer_steps: n, steps that an answer will take; by default what 95 % of the newest 100 took
     :param action_delay: from ``act`` to the moment that the action takes effect, in the unit of ``now``
@@ -212,12 +213,12 @@ class ControlLoop:
         with self._changed:
             self._check()
             if (ahead := (self._ledger.captured - now) / self.period) > AHEAD:
-                if ahead > FAR and math.isnan(self._offset):
+                if ahead > FAR and math.isnan(self._acted):
                     raise ValueError(
                         f"An observation was captured at {self._ledger.captured}, but now it is {now}; take both from "
                         "one clock, and the period in its unit."
                     )
-                self._ledger.captured = now  # the clock went back
+                self._ledger.turn_back(now, self._acted + self.period)
             if self._simulate is not None:
                 self._pretend(self._simulate)
             step = self._ledger.next_step()

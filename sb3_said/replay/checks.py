@@ -69,5 +69,5 @@ def check_order(
             f"The observation after the action of environment {np.argwhere(differs)[0, 0]} does not follow the one "
             "before it: its action_history is not the same with one action more. Transitions must be added in the "
             "order they happened, and each of them. If a callback or evaluate_policy steps the training environment "
-            "during learn(), give it an environment of its own."
+            f"during learn(), give it an environment of its own. {WRAPPER_ORDER}"
         )

@@ -19,7 +19,7 @@ from sb3_said.delays import (
     TotalDelay,
     UniformDelay,
 )
-from sb3_said.delays.processes import packet_delays
+from sb3_said.delays.processes import as_process, packet_delays
 from sb3_said.delays.receivers import RECEIVERS
 from sb3_said.delays.text import age_range
 
@@ -136,3 +136,12 @@ def test_the_range_of_ages():
     assert age_range((2, 3)) == (2, 3)
     assert age_range(TotalDelay(1, WIFI_20MS)) == (2, 7)
     assert age_range(DroppedPackets(PeriodicPackets(2, period=5), p=0.1)) == (2, 10)
+
+
+@pytest.mark.parametrize("text", ["WIFI_20MS", "UniformDelay(0, 2)", "3", "(1, 4)"])
+def test_processes_inside_may_be_text_as_delays_are(text):
+    process = as_process(text)
+    assert DroppedPackets(text, p=0.1) == DroppedPackets(process, p=0.1)
+    assert TotalDelay(text, "4") == TotalDelay(process, 4)
+    with pytest.raises(ValueError, match="UniformDelays"):
+        PeriodicPackets("UniformDelays(0, 2)", 5)

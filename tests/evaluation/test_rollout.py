@@ -144,6 +144,22 @@ def test_below_wrappers_that_change_rewards_a_monitor_counts_the_tasks_own() -> 
     np.testing.assert_allclose(own, returns, atol=1e-5)
 
 
+@pytest.mark.parametrize("own", [7, {"level": 2}])
+def test_what_a_task_itself_calls_its_episode_is_no_monitors(own: Any) -> None:
+    class Named(gym.Wrapper[Any, Any, Any, Any]):
+        def step(self, action: Any) -> Any:
+            *rest, info = super().step(action)
+            return *rest, {**info, "episode": own}
+
+    def make(wrap: Any) -> Any:
+        return lambda: wrap(gym.make("Pendulum-v1", max_episode_steps=5))
+
+    model = SimpleNamespace(predict=lambda observation, *_, **__: (np.zeros((len(observation), 1), np.float32), None))
+    np.testing.assert_array_equal(
+        rollout(model, make(Named), 2, 0).returns, rollout(model, make(lambda env: env), 2, 0).returns
+    )
+
+
 def test_an_episode_that_may_have_no_end_is_warned_of_once(monkeypatch: pytest.MonkeyPatch) -> None:
     _, lengths = by_hand(6)
     long = sorted(lengths)[-2]  # which ends right there, and one goes on

@@ -221,6 +221,25 @@ def test_it_is_saved_and_loaded(learned, tmp_path):
     assert loaded.num_timesteps == 600
 
 
+def test_each_update_is_a_rollout_that_begins_and_ends():
+    class Noted(BaseCallback):
+        calls = ""
+
+        def _on_rollout_start(self):
+            self.calls += "("
+
+        def _on_step(self):
+            self.calls += "."
+            return self.num_timesteps < 3
+
+        def _on_rollout_end(self):
+            self.calls += ")"
+
+    callback = Noted()
+    make().learn_offline(demonstrations(2), 5, callback=callback)
+    assert callback.calls == "(.)(.)(."  # as SB3 leaves the last one, which a callback ends
+
+
 def test_callbacks_follow_each_update_and_can_end_it():
     class Stop(BaseCallback):
         def _on_step(self):

@@ -125,6 +125,31 @@ def test_a_clock_that_goes_back_costs_no_observation_and_no_memory():
     assert loop.statistics().gaps == {0.0: 49}
 
 
+def test_a_simulated_clock_that_goes_back_is_followed_too():
+    model = Recorder(TASK, 4)
+    loop = ControlLoop(model, 0.02, **FREE)
+    for k, now in enumerate([100.0, 100.02, 90.04, 90.06, 80.0]):  # a log of a robot, played again
+        loop.observe(ZEROS + k, now)
+        loop.act(now)
+        loop.observe(ZEROS + k + 0.5, now + 0.001)
+    loop.act(80.02)
+    assert asked_for(model)[-1] == 4.5
+
+
+def test_a_clock_that_goes_back_leaves_the_age_as_it_is():
+    """Also where actions take effect later than observations are captured."""
+    loop, ages = ControlLoop(Recorder(TASK, 8), 0.02, action_delay=0.03, answer_steps=0, **FREE), []
+    now = 1000.0
+    for k in range(30):
+        now -= 10.0 * (k == 15)
+        loop.observe(ZEROS + k, now - 0.001)
+        loop.act(now)
+        ages.append(loop._ledger.age)
+        now += 0.02
+    assert set(ages[5:15]) == set(ages[17:]) == {2}
+    assert max(ages) == 3  # of the step in which it went back, whose observation is refused
+
+
 @pytest.mark.parametrize("now", [math.nan, math.inf])
 def test_what_is_no_time_is_refused_before_it_counts(now):
     loop = ControlLoop(Recorder(TASK, 4), 1, **FREE)

@@ -385,6 +385,17 @@ def test_stamps_of_another_clock_are_refused():
         loop.act(time.monotonic())
 
 
+def test_a_model_with_a_memory_is_refused():
+    """Of SB3-contrib's recurrent ones each answer depends on those before, of which some come never."""
+
+    class Recurrent(Recorder):
+        def predict(self, *args, **kwargs):
+            return super().predict(*args, **kwargs)[0], (ZEROS, ZEROS)
+
+    with pytest.raises((ValueError, RuntimeError), match="Recurrent answers with a memory, of type tuple"):
+        ControlLoop(Recurrent(TASK, 4), 1, simulate=lambda seconds: 0)
+
+
 def test_an_agent_without_delay():
     plain = make(Drift(length=1000))  # untrained, so that the expert answers
     loop = ControlLoop(plain, 1, simulate=lambda seconds: 0)
