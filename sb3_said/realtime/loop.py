@@ -41,8 +41,8 @@ class ControlLoop:
     Python runs one thread at a time. Where ``act`` must not wait for the few milliseconds that a model computes in
     Python, give the model a process of its own: :class:`~sb3_said.realtime.ModelProcess`.
 
-    :param model: anything with ``predict``, ``observation_space`` and ``action_space`` of Stable-Baselines3, and without
-        a memory between its answers
+    :param model: anything with ``predict``, ``observation_space`` and ``action_space`` of Stable-Baselines3, without a
+        memory between its answers
     :param period: of ``act``, in seconds; with ``simulate`` in the unit of ``now``
     :param answer_steps: n, steps that an answer will take; by default what 95 % of the newest 100 took
     :param action_delay: from ``act`` to the moment that the action takes effect, in the unit of ``now``
