@@ -213,26 +213,22 @@ def in_steps(milliseconds: float | np.ndarray, control_period: float) -> int | n
     return int(steps) if steps.ndim == 0 else steps
 
 
-def as_process(delay: Delay | str) -> DelayProcess:
-    """Turn what a user writes as ``delay`` into a process.
+def as_process(delay: Delay) -> DelayProcess:
+    """Make a process of a number or a pair; return a process as it is.
 
-    :param delay: an integer (fixed), a ``(low, high)`` pair (drawn anew each episode), a process, or any of these as
-        text (:func:`~sb3_said.delays.text.parse_process`)
+    :param delay: an integer (fixed), a ``(low, high)`` pair (drawn anew each episode), or a process
     :raises ValueError: for anything else
     """
-    if isinstance(delay, str):
-        from sb3_said.delays.text import parse_process  # which names the processes of this module
-
-        delay = parse_process(delay)
     if _is_integer(delay):
         return FixedDelay(delay)  # type: ignore[arg-type]  # an integer, which mypy does not follow
     if isinstance(delay, (tuple, list)) and len(delay) == 2 and all(map(_is_integer, delay)):
         return EpisodeDelay(*delay)
     if hasattr(delay, "sample") and hasattr(delay, "max_delay"):
         return delay
+    inside = "; inside another process give it as it is, and the whole as text" if isinstance(delay, str) else ""
     raise ValueError(
         "`delay` is an integer, a (low, high) pair of integers, a delay process (with max_delay and sample(rng)), "
-        f"or one of these as text, got {delay!r}."
+        f"or one of these as text, got {delay!r}{inside}."
     )
 
 

@@ -27,14 +27,24 @@ CONSTANTS: dict[str, DelayProcess] = {"WIFI_20MS": processes.WIFI_20MS}
 _EXAMPLE = '"DroppedPackets(UniformDelay(0, 8), p=0.1)"'
 
 
+def make_process(delay: Delay | str) -> DelayProcess:
+    """Turn what a user writes as ``delay`` into a process.
+
+    :param delay: an integer (fixed), a ``(low, high)`` pair (drawn anew each episode), a process, or any of these as
+        text (:func:`parse_process`)
+    :raises ValueError: for anything else
+    """
+    return as_process(parse_process(delay) if isinstance(delay, str) else delay)
+
+
 def age_range(delay: Delay | str) -> tuple[int, int]:
     """Return the smallest and the largest age amid an episode, in control steps.
 
     An episode's start has smaller ones. A user's own process without ``min_delay`` may bring any up to ``max_delay``.
 
-    :param delay: as :func:`as_process` takes it
+    :param delay: as :func:`make_process` takes it
     """
-    process = as_process(delay)
+    process = make_process(delay)
     return smallest_age(process), process.max_delay
 
 
@@ -56,13 +66,13 @@ def parse_process(text: str) -> int | tuple[int, int] | DelayProcess:
 
 
 def as_text(delay: Delay | str) -> Delay | str:
-    """Return a delay as :func:`as_process` reads it back from JSON; a user's own process stays the object it is.
+    """Return a delay as :func:`make_process` reads it back from JSON; a user's own process stays the object it is.
 
-    :param delay: as :func:`as_process` takes it
+    :param delay: as :func:`make_process` takes it
     """
     if isinstance(delay, (int, str)):
         return delay
-    process = as_process(delay)
+    process = make_process(delay)
     try:
         return repr(process) if parse_process(repr(process)) == process else delay
     except ValueError:

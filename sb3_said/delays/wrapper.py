@@ -11,7 +11,7 @@ from sb3_said.delays.combined import TotalDelay
 from sb3_said.delays.processes import LARGEST_DELAY, Delay, as_process, checked_count
 from sb3_said.delays.receivers import RECEIVERS, Actuator, NewestPacket
 from sb3_said.delays.space import EXECUTED, UNDELAYED, check_task, delayed_space, scale_action
-from sb3_said.delays.text import age_range, as_text
+from sb3_said.delays.text import age_range, as_text, make_process
 
 #: Keeps the delays' random numbers apart from those that the task draws from the same seed.
 DELAY_STREAM = 1
@@ -95,9 +95,9 @@ class DelayedObservationWrapper(
         )
         gym.Wrapper.__init__(self, env)
         obs_space, act_space = check_task(env.observation_space, env.action_space)
-        self.process = as_process(delay)
+        self.process = make_process(delay)
         if action_delay != 0:
-            self.process = TotalDelay(self.process, as_process(action_delay))
+            self.process = TotalDelay(self.process, make_process(action_delay))
         longest = self.process.max_delay if max_delay is None else max_delay
         self.max_delay = checked_count("max_delay", longest, 0, LARGEST_DELAY)
         if self.max_delay < self.process.max_delay:

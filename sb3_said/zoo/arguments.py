@@ -11,8 +11,7 @@ from typing import Any
 import gymnasium as gym
 import torch as th
 
-from sb3_said.delays.processes import as_process
-from sb3_said.delays.text import age_range
+from sb3_said.delays.text import age_range, make_process
 
 #: A delay as YAML has it: control steps, [low, high], or a process as text; None for a task without the wrapper.
 Delay = int | list[int] | str | None
@@ -132,13 +131,13 @@ def read_delay(words: list[str]) -> Delay:
     if len(words) > 1 and (len(words), len(numbers)) != (2, 2):
         raise ValueError(f"--delay takes N, or LOW HIGH, or one process in quotes, got {' '.join(words)}.")
     delay: int | list[int] | str = numbers if len(words) == 2 else numbers[0] if numbers else words[0]
-    as_process(delay)
+    make_process(delay)
     return delay
 
 
 def largest_delay(delay: Delay) -> int:
     """Return the largest age that a delay can bring, 0 without one."""
-    return 0 if delay is None else as_process(delay).max_delay
+    return 0 if delay is None else make_process(delay).max_delay
 
 
 def is_always(delay: Delay, age: int) -> bool:

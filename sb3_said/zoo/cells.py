@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_said.delays.processes import as_process
+from sb3_said.delays.text import make_process
 from sb3_said.evaluation import Interval, confidence_interval, stratified_interval, worst_tenth
 from sb3_said.files.atomic import write_json
 from sb3_said.offline import normalized_score, reference_returns
@@ -47,7 +47,7 @@ class Cell:
     def key(self) -> tuple[str, ...]:
         """The file's contents, the answer, the delay and the error: equal keys have equal results, but for rounding,
         which depends on how many episodes are played side by side."""
-        return self.sha256, str(self.answer), repr(as_process(self.delay)), str(self.age_error)
+        return self.sha256, str(self.answer), repr(make_process(self.delay)), str(self.age_error)
 
     @property
     def column(self) -> int | str:

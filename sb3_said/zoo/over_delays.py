@@ -21,8 +21,7 @@ from typing import Any
 import torch as th
 
 from sb3_said.delays import FixedDelay
-from sb3_said.delays.processes import as_process
-from sb3_said.delays.text import age_range
+from sb3_said.delays.text import age_range, make_process
 from sb3_said.evaluation import Summary, plots
 from sb3_said.files.atomic import check_writable
 from sb3_said.zoo.arguments import TRUST, add_playing, check_positive, explained, make_parser, read_delay
@@ -85,7 +84,7 @@ def main(argv: list[str] | None = None) -> None:
         # By process, which may be written in two ways: a second column of it would count as another training seed
         named: dict[str, int | str] = {}
         for name in map(read_name, args.delays or ()):
-            named.setdefault(repr(as_process(name)), name)
+            named.setdefault(repr(make_process(name)), name)
         delays = list(named.values())
         playing = "algo", "env", "episodes", "seed", "device", "gym_packages", "n_envs", "workers"
         unused = [name.replace("_", "-") for name in playing if getattr(args, name) != parser.get_default(name)]
@@ -115,7 +114,7 @@ def read_name(word: str) -> int | str:
     """
     delay = read_delay([word])
     assert delay is not None  # for mypy: there is a word
-    process = as_process(delay)
+    process = make_process(delay)
     return process.delay if isinstance(process, FixedDelay) else word
 
 
@@ -151,7 +150,7 @@ def known_cells(args: argparse.Namespace, delays: list[int | str]) -> list[Cell]
     ]
     if delays:
         pairs = [(delay, cell) for delay in delays for cell in cells]
-        same = [(delay, cell) for delay, cell in pairs if as_process(cell.delay) == as_process(delay)]
+        same = [(delay, cell) for delay, cell in pairs if make_process(cell.delay) == make_process(delay)]
         cells = [replace(cell, delay=delay) for delay, cell in same]
     if not cells:
         asked = f" of the delays {delays}" if delays else " of what is asked for" if results.cells else ""
@@ -271,7 +270,7 @@ def cells_of(label: str, row: list[LoadedRun], delays: list[int | str], only: st
     who = [answers(run.model) for run in row]
     for answer, delay in itertools.product(dict.fromkeys(itertools.chain(*who)), delays):
         for run, digest, can_answer in zip(row, digests, who, strict=True):
-            plays = one_delay or run.info["delay"] == delay_name(as_process(delay))
+            plays = one_delay or run.info["delay"] == delay_name(make_process(delay))
             if not plays or answer not in can_answer or (answer and only and answer != only):
                 continue
             yield Cell(

@@ -19,9 +19,9 @@ from sb3_said.delays import (
     TotalDelay,
     UniformDelay,
 )
-from sb3_said.delays.processes import as_process, packet_delays
+from sb3_said.delays.processes import packet_delays
 from sb3_said.delays.receivers import RECEIVERS
-from sb3_said.delays.text import age_range
+from sb3_said.delays.text import age_range, parse_process
 
 
 @pytest.mark.parametrize("inner", [-1, (4, 2), 1.5, None])
@@ -138,10 +138,8 @@ def test_the_range_of_ages():
     assert age_range(DroppedPackets(PeriodicPackets(2, period=5), p=0.1)) == (2, 10)
 
 
-@pytest.mark.parametrize("text", ["WIFI_20MS", "UniformDelay(0, 2)", "3", "(1, 4)"])
-def test_processes_inside_may_be_text_as_delays_are(text):
-    process = as_process(text)
-    assert DroppedPackets(text, p=0.1) == DroppedPackets(process, p=0.1)
-    assert TotalDelay(text, "4") == TotalDelay(process, 4)
-    with pytest.raises(ValueError, match="UniformDelays"):
-        PeriodicPackets("UniformDelays(0, 2)", 5)
+def test_text_is_of_the_whole():
+    for make in (lambda: DroppedPackets("WIFI_20MS", p=0.1), lambda: TotalDelay("WIFI_20MS", 4)):
+        with pytest.raises(ValueError, match="got 'WIFI_20MS'; inside another process give it as it is"):
+            make()
+    assert parse_process("DroppedPackets(WIFI_20MS, p=0.1)") == DroppedPackets(WIFI_20MS, p=0.1)

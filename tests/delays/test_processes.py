@@ -20,7 +20,8 @@ from sb3_said.delays import (
     UniformDelay,
     in_steps,
 )
-from sb3_said.delays.processes import as_process, packet_delays
+from sb3_said.delays.processes import packet_delays
+from sb3_said.delays.text import make_process
 
 # ---------------------------------------------------------------------------------------------------- writing
 
@@ -39,7 +40,7 @@ from sb3_said.delays.processes import as_process, packet_delays
     ],
 )
 def test_what_a_user_may_write(written, process):
-    assert as_process(written) == process
+    assert make_process(written) == process
 
 
 def test_whole_numbers_of_numpy_are_numbers():
@@ -52,7 +53,7 @@ def test_whole_numbers_of_numpy_are_numbers():
         (DroppedPackets(2, 0.1, max_losses=high), "DroppedPackets(process=FixedDelay(delay=2), p=0.1, max_losses=8)"),
         (HeldDelay(2, update_period=high), "HeldDelay(process=FixedDelay(delay=2), hold_prob=0.0, update_period=8)"),
     ]:
-        assert repr(process) == expected and as_process(expected) == process
+        assert repr(process) == expected and make_process(expected) == process
         for kwargs in ({"delay": process}, {"delay": 0, "action_delay": process}, {"delay": 0, "max_delay": high}):
             DelayedObservationWrapper(LoggedTask(), **kwargs).reset(seed=0)
 
@@ -60,7 +61,7 @@ def test_whole_numbers_of_numpy_are_numbers():
 @pytest.mark.parametrize("written", [-1, (-1, 2), (4, 2), 1.5, (0, 2.5), (1, 2, 3), True, (False, True), None, "4.5"])
 def test_what_is_refused(written):
     with pytest.raises(ValueError, match=r"delay"):
-        as_process(written)
+        make_process(written)
 
 
 @pytest.mark.parametrize(
@@ -125,7 +126,7 @@ def test_any_process_stays_in_its_range_and_repeats_with_its_seed(process, seed)
     delays = draw_packets(process, 60, seed)
     assert delays.min() >= -1 and delays.max() <= process.max_delay
     np.testing.assert_array_equal(delays, draw_packets(process, 60, seed))
-    assert hash(process) == hash(as_process(process))  # an immutable description
+    assert hash(process) == hash(make_process(process))  # an immutable description
 
 
 @pytest.mark.parametrize("process", [FixedDelay(5), FixedDelay(0)])

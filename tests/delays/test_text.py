@@ -16,8 +16,8 @@ from sb3_said.delays import (
     TotalDelay,
     UniformDelay,
 )
-from sb3_said.delays.processes import as_process, packet_delays
-from sb3_said.delays.text import age_range, parse_process
+from sb3_said.delays.processes import packet_delays
+from sb3_said.delays.text import age_range, make_process, parse_process
 
 
 @settings(deadline=None)
@@ -32,7 +32,7 @@ def test_processes_of_processes():
     )
     held = parse_process("HeldDelay(TotalDelay(WIFI_20MS, (0, 2)), hold_prob=0.5)")
     assert held == HeldDelay(TotalDelay(WIFI_20MS, (0, 2)), hold_prob=0.5)
-    assert as_process("DroppedPackets([0, 4], p=0.1)") == DroppedPackets(EpisodeDelay(0, 4), p=0.1)
+    assert make_process("DroppedPackets([0, 4], p=0.1)") == DroppedPackets(EpisodeDelay(0, 4), p=0.1)
     assert DroppedPackets(4, p=0.1) == DroppedPackets(
         FixedDelay(4), p=0.1
     )  # a number is the process that it stands for
@@ -70,7 +70,7 @@ def test_processes_of_processes():
 )
 def test_anything_else_is_refused_and_not_run(text, message):
     with pytest.raises(ValueError, match=message.replace("(", r"\(")) as caught:
-        as_process(text)
+        make_process(text)
     assert len(str(caught.value)) < 1000
 
 
@@ -83,8 +83,8 @@ def test_nested_processes_take_no_longer_than_their_text(outer):
         text = outer.format(text)
     low, high = age_range(text)
     assert 4 <= low <= high < 4 + 60 * 4 + 1
-    assert hash(as_process(text)) == hash(as_process(repr(as_process(text))))
-    assert next(packet_delays(as_process(text), np.random.default_rng(0))) in (None, *range(high + 1))
+    assert hash(make_process(text)) == hash(make_process(repr(make_process(text))))
+    assert next(packet_delays(make_process(text), np.random.default_rng(0))) in (None, *range(high + 1))
 
 
 def test_the_wrapper_takes_text():
