@@ -69,7 +69,7 @@ class Video:
 
         :raises CannotDraw: without a working graphics library
         """
-        rate = env.metadata.get("render_fps", self.fps)  # control steps a second
+        rate = env.metadata.get("render_fps") or self.fps  # control steps a second
         self.fps = min(self.fps, rate)
         due = self._steps * self.fps / rate
         self._steps += 1

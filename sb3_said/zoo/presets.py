@@ -62,7 +62,7 @@ def preset_overrides(
         raise ValueError(f"{config} is no YAML: {error}") from error
     if not isinstance(document, dict):
         raise ValueError(f"{config} holds a {type(document).__name__}, expected settings by task, such as Hopper-v5:.")
-    presets = {"cpu": {"default": {}}, **document.get("presets", {})}
+    presets = {"cpu": {"default": {}}, **(document.get("presets") or {})}
     if preset not in presets:
         raise ValueError(f"{config} has no preset '{preset}', only {[*presets]}.")
     suited = document.get("by_dataset", {}).get(env_id, {}).get(kind, {})

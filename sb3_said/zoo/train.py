@@ -177,7 +177,8 @@ def read_command_line(argv: list[str]) -> tuple[Run, str, list[str]]:
 def of_the_start(argv: list[str]) -> dict[str, str | None]:
     """Return those of rl_zoo3's options that have no effect once a run has begun, with what they were given."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    for names in (("-conf", "--conf-file"), ("-f", "--log-folder"), ("--storage",), ("--study-name",), ("--trial-id",)):
+    options = (("-conf", "--conf-file"), ("-f", "--log-folder"), ("-i", "--trained-agent"))
+    for names in (*options, ("--storage",), ("--study-name",), ("--trial-id",)):
         parser.add_argument(*names, dest=names[-1])
     return vars(parser.parse_known_args(argv)[0])
 

@@ -290,12 +290,12 @@ def test_enjoy_says_what_is_wrong(
     assert exit_info.value.code == 2 and message in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("fps", "expected"), [(10, 40), (25, 100), (60, 100)])
-def test_video_plays_in_real_time(fps: int, expected: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("fps", "expected", "own"), [(10, 40, 25), (25, 100, 25), (60, 100, 25), (60, 100, None)])
+def test_video_plays_in_real_time(fps: int, expected: int, own: int | None, tmp_path: Path) -> None:
     imageio = pytest.importorskip("imageio.v3")
 
     class Drawn:
-        metadata = {"render_fps": 25}
+        metadata = {"render_fps": own}
 
         def render(self) -> np.ndarray:
             return np.random.default_rng(video._steps).integers(0, 255, (32, 32, 3), np.uint8)
@@ -304,7 +304,7 @@ def test_video_plays_in_real_time(fps: int, expected: int, tmp_path: Path) -> No
     for _ in range(100):  # 4 seconds
         video.on_step(Drawn())
     video.close()
-    assert video.frames == expected and video.fps == min(fps, 25)
+    assert video.frames == expected and video.fps == min(fps, own or fps)
     assert len(imageio.imread(video.path)) == expected
     assert imageio.immeta(video.path)["duration"] == pytest.approx(1000 / video.fps, abs=10)  # GIFs count in 10 ms
 

@@ -165,6 +165,11 @@ def test_every_preset_exists_for_every_algorithm(algo: str, preset: str) -> None
     assert isinstance(preset_overrides(config_file(algo), preset, "Hopper-v5", 4), dict)
 
 
+def test_a_file_of_ones_own_may_name_no_preset(tmp_path: Path) -> None:
+    (tmp_path / "own.yml").write_text("presets:\n")
+    assert preset_overrides(tmp_path / "own.yml", "cpu", "Hopper-v5", 4) == {}
+
+
 def test_an_unknown_preset_is_named() -> None:
     with pytest.raises(ValueError, match="no preset 'fast'"):
         preset_overrides(config_file("said"), "fast", "Hopper-v5", 4)

@@ -403,7 +403,7 @@ def test_a_search_of_rl_zoo3_leaves_no_folder_of_a_run(tmp_path: Path) -> None:
 def test_a_resume_takes_no_option_of_the_start(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for words in ("-conf own.yml", "-f elsewhere", "--storage x.log", "--study-name s", "--trial-id 3"):
+    for words in ("-conf own.yml", "-f elsewhere", "--storage x.log", "--study-name s", "--trial-id 3", "-i a.zip"):
         with pytest.raises(SystemExit):
             train.main(["--resume", str(finished), *words.split()])
         assert "goes on with the run's own --" in capsys.readouterr().err
