@@ -7,7 +7,7 @@ import torch as th
 from sb3_said.sac.scaling import OnTheHost
 
 N_EPISODES = 10  # whose mean is looked at
-LOST = 0.5  # of what was learned: by hindsight on four runs, results/stable_expert.md
+LOST = 0.5  # of what was learned: by hindsight on two runs, results/stable_expert.md
 FORGETS = 100_000  # environment steps in which the best is forgotten, where no episode returns as much any more
 
 
