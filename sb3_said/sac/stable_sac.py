@@ -164,14 +164,14 @@ class StableSAC(DelayedSAC):
             seen = self.replay_buffer.sample(n_states, env=self._vec_normalize_env).observations
             normalizer.fit(seen[UNDELAYED] if isinstance(seen, dict) else seen, self.num_timesteps)
 
-    def _average_actor(self) -> None:
-        """Move the average towards the actor; of the first updates it is the plain mean."""
-        average, episodes = self.policy.averaged_actor, self.policy.training_episodes
-        if average is None or episodes is None:
-            return
-        n = self._n_updates // self.policy_delay
+    def _average_actor(self, waits: bool = False) -> None:
+        """Move the average towards the actor; of the first updates it is the plain mean.
+
+        :param waits: leave it where it is, if it is more than that mean
+        """
+        average, n = self.policy.averaged_actor, self._n_updates // self.policy_delay
         decay = min(self.actor_averaging, 1.0 - 1.0 / n)
-        if decay == self.actor_averaging and episodes.have_collapsed:
+        if average is None or (waits and decay == self.actor_averaging):
             return
         polyak_update(self.actor.parameters(), average.parameters(), 1.0 - decay)
         for own, averaged in zip(self.actor.buffers(), average.buffers(), strict=True):
@@ -186,6 +186,8 @@ class StableSAC(DelayedSAC):
         self._update_learning_rate(learned if self.ent_coef_optimizer is None else [*learned, self.ent_coef_optimizer])
         self._look_at_states()
         scale = 1.0 if self.policy.return_scale is None else self.policy.return_scale.value
+        episodes = self.policy.training_episodes
+        waits = episodes is not None and episodes.have_collapsed  # none ends during the updates
         losses: dict[str, list[float]] = {"critic_loss": [], "actor_loss": [], "ent_coef_loss": []}
 
         for _ in range(gradient_steps):
@@ -217,7 +219,7 @@ class StableSAC(DelayedSAC):
                 self.actor.optimizer.zero_grad()
                 actor_loss.backward(inputs=[p for p in self.actor.parameters() if p.requires_grad])
                 self.actor.optimizer.step()
-                self._average_actor()
+                self._average_actor(waits)
                 losses["actor_loss"].append(actor_loss.item())
 
                 # Entropy coefficient
@@ -237,8 +239,8 @@ class StableSAC(DelayedSAC):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/ent_coef", float(self._ent_coef()))
         self.logger.record("train/reward_scale", float(scale))
-        if self.policy.training_episodes is not None:
-            self.logger.record("train/average_waits", float(self.policy.training_episodes.have_collapsed))
+        if episodes is not None:
+            self.logger.record("train/average_waits", float(waits))
         for name, values in losses.items():
             if values:
                 self.logger.record(f"train/{name}", float(np.mean(values)))
