@@ -28,7 +28,8 @@ class Rollout:
     """What ``rollout`` measured."""
 
     returns: np.ndarray
-    """(n_episodes,) float64, sum of the environment's own rewards, in the order of the reset seeds"""
+    """(n_episodes,) float64, sum of the rewards, in the order of the reset seeds: those below an SB3 ``Monitor`` where
+    the environment has one, and so the task's own"""
     lengths: np.ndarray
     """(n_episodes,) int64, in control steps"""
     terminated: np.ndarray
@@ -96,7 +97,7 @@ def rollout(
 
             going_on = {}  # by the row in this batch
             for row, (e, episode, _) in enumerate(playing):
-                observation, reward, terminated, truncated, info = e.step(actions[row])
+                observation, reward, terminated, truncated, _ = e.step(actions[row])
                 returns[episode] += float(reward)
                 lengths[episode] += 1
                 ended[episode] = terminated
@@ -112,9 +113,7 @@ def rollout(
                 if on_step is not None:
                     on_step(e)
                 if terminated or truncated:
-                    monitored = info.get("episode")  # below wrappers that change rewards, as in training
-                    if isinstance(monitored, dict) and "r" in monitored:
-                        returns[episode] = monitored["r"]
+                    returns[episode] = _monitored(e, returns[episode])
                     if on_episode is not None:
                         on_episode(episode, float(returns[episode]), int(lengths[episode]))
                     if next_episode == n_episodes:
@@ -195,6 +194,15 @@ def measure_latency(
 
 def _make(env: EnvMaker) -> gym.Env[Any, Any]:
     return gym.make(env) if isinstance(env, str) else env()
+
+
+def _monitored(env: gym.Env[Any, Any], counted: float) -> float:
+    """Return what a Monitor has counted, below wrappers that change rewards or end episodes; without one, the given."""
+    from stable_baselines3.common.env_util import unwrap_wrapper
+    from stable_baselines3.common.monitor import Monitor  # with the room, torch would be imported
+
+    monitor = unwrap_wrapper(env, Monitor)
+    return sum(monitor.rewards) if isinstance(monitor, Monitor) else counted
 
 
 def _half_range(space: gym.Space[Any]) -> np.ndarray:

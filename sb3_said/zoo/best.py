@@ -13,7 +13,7 @@ import yaml
 from sb3_said.files.atomic import write_text
 from sb3_said.files.normalization import normalization_file
 from sb3_said.zoo.folder import TUNED_SETTINGS
-from sb3_said.zoo.record import Record
+from sb3_said.zoo.record import Record, evaluated
 
 
 def write_best(run: Path, folder: Path, planner: dict[str, Any], choice: str) -> str:
@@ -60,5 +60,8 @@ def plain_settings(record: Record) -> tuple[dict[str, Any], list[str]]:
         try:
             block[name] = yaml.safe_load(yaml.safe_dump(value))
         except yaml.YAMLError:
-            left_out.append(name)
+            try:
+                block[name] = evaluated(name, value)
+            except ValueError:
+                left_out.append(name)
     return block, left_out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import csv
 import shlex
 from pathlib import Path
@@ -14,11 +15,12 @@ from huggingface_hub import EvalResult, ModelCard, ModelCardData
 from sb3_said import SAID
 from sb3_said.delays.space import written_ages
 from sb3_said.files.atomic import check_writable
+from sb3_said.files.normalization import normalization_file
 from sb3_said.zoo.arguments import explained, make_parser
 from sb3_said.zoo.cells import Cell, Results, average
 from sb3_said.zoo.over_delays import digest_of
 from sb3_said.zoo.presets import config_file, preset_overrides
-from sb3_said.zoo.record import Record
+from sb3_said.zoo.record import Record, evaluated
 from sb3_said.zoo.runs import LoadedRun, control_period, load_run, longest_delay
 
 EPILOG = """\
@@ -146,14 +148,12 @@ def describe(
         "training seed": record.seed,
         "made by": f"`{made_by(record, run.model)}`",
         "SHA-256": f"`{digest_of(run)}`",
+        **({} if run.normalize is None else {"belongs beside it": f"`{normalization_file(file).name}`"}),
         "median decision": "not measured" if latency_ms is None else f"{latency_ms:g} ms, one CPU thread",
     }
     lines = [
         "```python",
-        f"from sb3_said import {kind}",
-        "",
-        f'model = {kind}.load("{file.name}")',
-        "action, _ = model.predict(observation, deterministic=True)  # of a DelayedObservationWrapper",
+        *use(run),
         "```",
         "",
         f"`sb3-said enjoy {file.name} --delay {longest_delay(run.model) or 0} --record video.mp4` shows it.",
@@ -176,6 +176,21 @@ def describe(
             texts.append(average({column: np.array(found[0]["returns"])}, [column])[0] if found and found[0] else "-")
         lines.append(f"| {column} | " + " | ".join(texts) + " |")
     return "\n".join(lines)
+
+
+def use(run: LoadedRun) -> list[str]:
+    """Return the lines of Python that let an agent act."""
+    kind, file = type(run.model).__name__, Path(run.info["file"])
+    head, load = [f"from sb3_said import {kind}"], [f'model = {kind}.load("{file.name}")']
+    if run.normalize is None:
+        act = "action, _ = model.predict(observation, deterministic=True)  # of a DelayedObservationWrapper"
+        return [*head, "", *load, act]
+    head = ["from stable_baselines3.common.vec_env import DummyVecEnv", "", *head]
+    head.append("from sb3_said.files.normalization import load_normalization")
+    beside = normalization_file(file).name
+    load.append(f'statistics = load_normalization("{beside}", DummyVecEnv([make_env]))  # what it read in training')
+    read = "statistics.normalize_obs(observation)"
+    return [*head, "", *load, f"action, _ = model.predict({read}, deterministic=True)  # of what make_env makes"]
 
 
 def ages_trained_on(run: LoadedRun, record: Record) -> list[int]:
@@ -227,6 +242,23 @@ def made_by(record: Record, model: Any = None) -> str:
     if trained := record.options.get("trained_agent"):
         words += ["-i", trained]
     words += ["--seed", str(record.seed)]
+    left_out = [*record.missing]
     for option, settings in (("-params", own), ("--env-kwargs", record.env_kwargs)):
-        words += [option, *(f"{name}:{value!r}" for name, value in settings.items())] if settings else []
-    return shlex.join(words)
+        texts = {name: as_word(name, value) for name, value in settings.items()}
+        left_out += [name for name, text in texts.items() if text is None]
+        given = [f"{name}:{text}" for name, text in texts.items() if text is not None]
+        words += [option, *given] if given else []
+    return shlex.join(words) + f"  # and {', '.join(left_out)}, which no command line holds" * bool(left_out)
+
+
+def as_word(name: str, value: Any) -> str | None:
+    """Write a setting as a command line takes it: Python, or text of Python with rl_zoo3's names; None if neither."""
+    try:
+        ast.literal_eval(repr(value))
+        return repr(value)
+    except (SyntaxError, ValueError):
+        pass
+    try:
+        return repr(evaluated(name, value))
+    except ValueError:
+        return None

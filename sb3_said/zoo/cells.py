@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from filelock import FileLock
 
 from sb3_said.delays.text import make_process
 from sb3_said.evaluation import Interval, confidence_interval, stratified_interval, worst_tenth
@@ -50,13 +52,18 @@ class Cell:
         return self.sha256, str(self.answer), repr(make_process(self.delay)), str(self.age_error)
 
     @property
+    def lineage(self) -> tuple[str, str]:
+        """The file and the label: an agent of both, but of other contents, is an earlier state of this one."""
+        return self.file, self.agent.removesuffix(f" {self.answer}")
+
+    @property
     def column(self) -> int | str:
         """What the table shows it under: its delay, and how wrong the age is told."""
         return f"{self.delay}{AGE}{self.age_error:+d}" if self.age_error else self.delay
 
 
 class Results:
-    """The cells of a JSON file, which is always written whole.
+    """The cells of a JSON file, which is always written whole. Several processes may add to one file at a time.
 
     :param path: of the file; new where there is none
     :param settings: what all cells have in common; those of the file by default
@@ -69,6 +76,8 @@ class Results:
             raise ValueError(f"{path} does not exist: sb3-said over-delays writes it, where runs to play are named.")
         found, self.origins, self.cells = _read(path) if path.exists() else (settings or {}, [], [])
         self.settings = found if settings is None else settings
+        self._asked: list[Cell] = []
+        self._own: int | None = None  # which of the origins is this process's
         if found != self.settings:
             raise ValueError(f"{path} holds {found}, but {settings} is to be played: give another --json.")
 
@@ -76,16 +85,40 @@ class Results:
         """Put these cells first, and fill in known results; drop cells of agents whose file has changed."""
         known = {cell.key: cell for cell in self.cells if cell.result is not None}
         for cell in cells:
-            if cell.obstacle is None and (old := known.get(cell.key)) is not None:
+            if cell.obstacle is None and cell.result is None and (old := known.get(cell.key)) is not None:
                 cell.origin, cell.result = old.origin, old.result
-        asked, files = {cell.key for cell in cells}, {cell.file: cell.sha256 for cell in cells}
+        asked, agents = {cell.key for cell in cells}, {cell.lineage: cell.sha256 for cell in cells}
         others = [cell for cell in self.cells if cell.key not in asked]
-        self.cells = cells + [cell for cell in others if files.get(cell.file, cell.sha256) == cell.sha256]
+        self.cells = cells + [x for x in others if agents.get(x.lineage, x.sha256) == x.sha256]
+        self._asked = cells
+
+    def add(self, cell: Cell, result: dict[str, Any], origin: dict[str, Any]) -> None:
+        """Give one of the cells asked for its result, and write the file.
+
+        :param origin: command, date, machine and versions
+        """
+        with self._newest():
+            if self._own is None:  # each process has one, and none is ever removed
+                self._own = len(self.origins)
+                self.origins.append(origin)
+            cell.origin, cell.result = self._own, result
 
     def write(self) -> None:
         """Write the file, whole or not at all, without the cells that are still to be played."""
-        cells = [asdict(cell) for cell in self.cells if cell.result is not None or cell.obstacle is not None]
-        write_json(self.path, {**self.settings, "origins": self.origins, "cells": cells})
+        with self._newest():
+            pass
+
+    @contextmanager
+    def _newest(self) -> Iterator[None]:
+        """Take in what other processes have added since, and write the file after the context, before they do again."""
+        with FileLock(self.path.with_name(f".{self.path.name}.lock")):
+            if self.path.exists():
+                newest = Results(self.path, self.settings)
+                newest.ask(self._asked)
+                self.origins, self.cells = newest.origins, newest.cells
+            yield
+            cells = [asdict(cell) for cell in self.cells if cell.result is not None or cell.obstacle is not None]
+            write_json(self.path, {**self.settings, "origins": self.origins, "cells": cells})
 
 
 def _read(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]], list[Cell]]:

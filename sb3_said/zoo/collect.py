@@ -186,12 +186,14 @@ def main(argv: list[str] | None = None) -> None:
                 unused[share.name, share.noise] = 1 + max(episode.seed for episode in parts[-1])
         run = shares[0].run
         told = [describe(share, part, run.info["env"]) for share, part in zip(shares, parts, strict=True)]
-        about = json.dumps({**origin(run), "seed": args.seed, "shares": told})
+        about = json.dumps({**origin(run), "seed": args.seed, "changes": json.loads(run.setting), "shares": told})
         data = join([episode for part in parts for episode in part])
         env = run.make_env()
         write_dataset(data, args.output, env, about, ", ".join(dict.fromkeys(share.name for share in shares)))
         env.close()
     print(f"Wrote {args.output}: {len(data):,} steps, {len(data.lengths):,} episodes")
+    if run.changes:
+        print(f"They are of {run.info['env']} changed by {run.setting}, which its id does not say.")
 
 
 def open_agents(args: argparse.Namespace) -> Iterator[Share]:
@@ -207,12 +209,16 @@ def open_agents(args: argparse.Namespace) -> Iterator[Share]:
     tasks = {run.info["env"]: run for run in runs.values()}
     if len(tasks) > 1:
         raise ValueError(f"A dataset is of one task, but the agents are of {', '.join(tasks)}.")
+    settings = {run.setting: run.changes for run in runs.values()}
+    if len(settings) > 1:
+        raise ValueError(f"A dataset is of one task, but the agents change theirs differently: {'; '.join(settings)}.")
     if "random" in names:
         if not tasks and args.env is None:
             raise ValueError("Random actions are of no task: give --env.")
         make_env = next(iter(runs.values())).make_env if runs else lambda: gym.make(args.env)
         info = {"env": args.env or next(iter(tasks)), "algo": "random"}
-        runs["random"] = LoadedRun(None, make_env, None, Path(), info)  # type: ignore[arg-type]
+        changes = next(iter(settings.values()), {})
+        runs["random"] = LoadedRun(None, make_env, None, Path(), info, changes)  # type: ignore[arg-type]
     for run in runs.values():
         env = run.make_env()
         check_spaces(env.observation_space, env.action_space)
@@ -230,7 +236,9 @@ def open_agent(name: str, args: argparse.Namespace) -> LoadedRun:
     path = Path(name)
     if not (path.is_file() and zipfile.is_zipfile(path) and "policy.pth" in zipfile.ZipFile(path).namelist()):
         played = args.algo, args.env, read_delay(args.delay), args.device
-        return load_run(path, *played, gym_packages=args.gym_packages)
+        run = load_run(path, *played, gym_packages=args.gym_packages)
+        changes = {name: given for name, given in run.changes.items() if name != "action_delay"}  # no log shows it
+        return replace(run, changes=changes)
     if args.env is None or args.algo not in ALGOS:
         raise ValueError(f"{path} is of Stable-Baselines3: name its task with --env and its class with --algo.")
     if args.delay:
@@ -329,7 +337,7 @@ def describe(share: Share, episodes: list[Episode], env_id: str) -> dict[str, An
     mean = float(np.mean(returns)) if returns else None
     told: dict[str, Any] = {"agent": share.name, "noise": share.noise, "episodes": len(episodes), "mean_return": mean}
     earned = "none of them whole" if mean is None else f"mean return {mean:,.1f}"
-    if mean is not None and reference_returns(env_id) is not None:
+    if mean is not None and not share.run.changes and reference_returns(env_id) is not None:
         told["normalized_score"] = float(normalized_score(mean, env_id))
         earned += f", normalised score {told['normalized_score']:.1f}"
     print(f"{share.name}, noise {share.noise:g}: {len(episodes)} episodes, {earned}", file=sys.stderr)

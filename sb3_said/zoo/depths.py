@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import zlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -48,14 +50,17 @@ class DepthPlanners:
         self.config = replace(model.policy.planner.config, decided_by="plan")  # else the tries would all be alike
         serves = int(model.policy.planner_updates) == self.gradient_steps
         self._own = model.policy.planner if serves else None
+        weights = (weight.detach().cpu().numpy().data for weight in model.policy.parameters())
+        self._agent = f"{functools.reduce(lambda found, weight: zlib.crc32(weight, found), weights, 0):08x}"
 
     def path(self, depth: int) -> Path:
         """Where the planner of a depth is kept."""
         return self.folder / f"planner_depth{depth}.zip"
 
     def training(self, depth: int) -> dict[str, Any]:
-        """Return what decides a planner's weights, in JSON types."""
+        """Return what decides a planner's weights, in JSON types; of the run that is its replay, told by its agent."""
         return {
+            "agent": self._agent,
             "gradient_steps": self.gradient_steps,
             "newest_fraction": self.model.newest_fraction,
             "terminal_penalty": self.model.planner_terminal_penalty,

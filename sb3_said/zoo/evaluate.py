@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import math
 from dataclasses import replace
 from functools import partial
@@ -95,7 +96,22 @@ def opened(args: argparse.Namespace) -> tuple[dict[str, LoadedRun], Path, float]
     name = "realtime.json" if args.realtime else "evaluation.json"
     target = args.json or run.folder / (name if Path(args.run).is_dir() else f"{Path(args.run).stem}_{name}")
     check_writable(target)
+    check_replaceable(target)
     return runs, target, period
+
+
+def check_replaceable(target: Path) -> None:
+    """
+    :raises ValueError: for a file of something else than numbers that this command wrote
+    """
+    if not target.is_file() or not (text := target.read_text(errors="replace")):
+        return
+    try:
+        if "results" in json.loads(text):
+            return
+    except (ValueError, TypeError):  # no JSON, or a number
+        pass
+    raise ValueError(f"{target} holds something else than what sb3-said evaluate writes: give another --json.")
 
 
 def measure(args: argparse.Namespace, runs: dict[str, LoadedRun], target: Path, period: float) -> None:

@@ -26,7 +26,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from sb3_said import SAID, DelayedSAC, PlannerTrainingCallback, StableSAC
 from sb3_said.files.archive import SavedFileError
 from sb3_said.files.arguments import with_given
-from sb3_said.files.atomic import write_json
+from sb3_said.files.atomic import write_json, write_text
 from sb3_said.files.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback, restore_training
 from sb3_said.files.normalization import load_normalization, normalization_file, save_normalization
 from sb3_said.offline import BC, DQL, OfflineAlgorithm
@@ -130,6 +130,7 @@ class DelayedExperimentManager(ExperimentManager):
         self.run = run
         self.stopping = Stopping()
         self._of_expert = True  # are the environments made now
+        self._has_told = False  # that there is no delay
         self.lock: FileLock | None = None
         self._uuid = zoo_kwargs.get("uuid_str", "")
         given = self.custom_hyperparams or {}
@@ -186,8 +187,6 @@ class DelayedExperimentManager(ExperimentManager):
         if wrappers:
             saved["env_wrapper"] = hyperparams["env_wrapper"] = wrappers
             print(f"Wrappers, from the task outwards: {wrappers}")
-        if "DelayedObservationWrapper" not in str(wrappers):
-            print(f"NO DELAY: this trains on {self.env_name.gym_id} without any delay; --delay 4 adds one of 4 steps.")
         return hyperparams, saved
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
@@ -230,7 +229,11 @@ class DelayedExperimentManager(ExperimentManager):
                 with_delay(self._own_wrappers, *(delays if self._of_expert else delays[::-1]))
             )
         with shielded():
-            return super().create_envs(*args, **kwargs)
+            env = super().create_envs(*args, **kwargs)
+        if not self._has_told and "action_history" not in getattr(env.observation_space, "spaces", {}):
+            self._has_told = True  # a task may be registered with its delay, so its wrappers do not say
+            print(f"NO DELAY: this trains on {self.env_name.gym_id} without any delay; --delay 4 adds one of 4 steps.")
+        return env
 
     def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
         """Normalise as rl_zoo3 does, but read what a given agent (-i) learned from a file without pickle."""
@@ -322,8 +325,8 @@ class DelayedExperimentManager(ExperimentManager):
         :param model: newly made
         :raises SystemExit: for a checkpoint that is damaged, or of another training
         """
-        resumes = self.checkpoint.exists()
-        (self.folder / ENDED_NAME).unlink(missing_ok=True)
+        resumes, ended = self.checkpoint.exists(), self.folder / ENDED_NAME
+        had_ended = ended.read_text() if ended.is_file() else None
         if resumes:
             with ending_training(SavedFileError):
                 callbacks = CallbackList(self.callbacks)
@@ -332,6 +335,7 @@ class DelayedExperimentManager(ExperimentManager):
             drop_undone_episodes(self.checkpoint)
         if self.run.record is not None:
             self._write_config()
+        ended.unlink(missing_ok=True)
         taken = model.num_timesteps if resumes else 0  # learn() counts the steps of an agent given with -i anew
         model.set_logger(self._logger(taken))
         # rl_zoo3: -1 is the default, anything below logs nothing by itself
@@ -345,6 +349,8 @@ class DelayedExperimentManager(ExperimentManager):
         except SystemExit:
             if self.run.record is not None:  # the planner's checkpoint is of the settings before
                 self.run.record.write(self.folder)
+            if had_ended is not None:
+                write_text(ended, had_ended)
             raise
         except KeyboardInterrupt:
             self.stopping.is_asked = True

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import hashlib
 import itertools
-import json
 import multiprocessing
 import os
 import re
@@ -51,7 +50,7 @@ A delay longer than an agent was built for leaves an empty cell. One that it was
 warning. Episode i starts from reset seed --seed + i in every cell. A row of one agent has intervals over these starts,
 a row of several training seeds over the seeds: by BCa bootstrap, or by Student's t where there are fewer than 10.
 A call plays only the cells that --json lacks, so the same command goes on after a stop. An agent whose file has changed
-is played again. The file keeps the cells of other agents and delays.
+is played again. The file keeps the cells of other agents and delays, and several calls may add to it at a time.
 {TRUST}
 """
 
@@ -188,12 +187,11 @@ def play_missing(args: argparse.Namespace, delays: list[int | str]) -> list[Cell
         if cell.obstacle is not None:
             print(f"{cell.agent} cannot play delay {cell.column}: {cell.obstacle}.")
     print(f"{len(todo)} of {len(cells)} cells to play")
-    if todo:
-        results.origins.append(origin(first))
+    made = origin(first)
     for done, (cell, summary) in enumerate(play_all(todo, settings["env"], args), 1):
-        cell.origin, cell.result = len(results.origins) - 1, summary.to_dict()
-        del cell.result["label"]  # another call can give the agent another one
-        results.write()
+        result = summary.to_dict()
+        del result["label"]  # another call can give the agent another one
+        results.add(cell, result, made)
         print(f"{done}/{len(todo)} {cell.agent}, delay {cell.column}: {summary.mean_return}", flush=True)
     results.write()
     print(f"Wrote {args.json}")
@@ -223,11 +221,16 @@ def open_runs(args: argparse.Namespace) -> dict[str, list[LoadedRun]]:
                 f"The label {label} has the agent {run.info['file']} twice: give it other training seeds of the same "
                 f"setting, or give each run its own label, as in LABEL={path}."
             )
+        if row and not given:
+            raise ValueError(
+                f"{path} and {row[0].info['file']} would both be called {label}: give each its own label, as in "
+                f"LABEL={path}, or one label to training seeds of one setting."
+            )
         row.append(run)
     tasks = sorted({run.info["env"] for row in runs.values() for run in row})
     if len(tasks) > 1:
         raise ValueError(f"Returns of several tasks cannot be compared: {tasks}. Give runs of one task, or --env.")
-    settings = {label: [setting_of(run) for run in row] for label, row in runs.items()}
+    settings = {label: [run.setting for run in row] for label, row in runs.items()}
     for label, given in settings.items():
         if len(set(given)) > 1:
             raise ValueError(
@@ -248,14 +251,9 @@ def at_any_age() -> Iterator[None]:
         yield
 
 
-def setting_of(run: LoadedRun) -> str:
-    """Return what a run changes in its task but the delay of observations, as text."""
-    return json.dumps(run.changes, sort_keys=True, default=repr)
-
-
 def digest_of(run: LoadedRun) -> str:
     """Return the SHA-256 of an agent's file, and of what its run changes in the task but its delay, if anything."""
-    changes = setting_of(run).encode() if run.changes else b""
+    changes = run.setting.encode() if run.changes else b""
     return hashlib.sha256(Path(run.info["file"]).read_bytes() + changes).hexdigest()
 
 

@@ -57,11 +57,13 @@ def preset_overrides(
     """
     is_yaml, kind = Path(config).suffix in (".yml", ".yaml"), dataset_kind(dataset)
     try:
-        document = (yaml.safe_load(Path(config).read_text()) if is_yaml else None) or {}
+        document = yaml.safe_load(Path(config).read_text()) if is_yaml else {}
     except yaml.YAMLError as error:
         raise ValueError(f"{config} is no YAML: {error}") from error
-    if not isinstance(document, dict):
-        raise ValueError(f"{config} holds a {type(document).__name__}, expected settings by task, such as Hopper-v5:.")
+    block = document.get(env_id, document.get("default", {})) if isinstance(document, dict) else document
+    if not isinstance(block, dict):
+        held = "nothing" if block is None else f"a {type(block).__name__}"
+        raise ValueError(f"{config} holds {held}, expected settings by task, such as {env_id}: {{n_timesteps: 9000}}.")
     presets = {"cpu": {"default": {}}, **(document.get("presets") or {})}
     if preset not in presets:
         raise ValueError(f"{config} has no preset '{preset}', only {[*presets]}.")

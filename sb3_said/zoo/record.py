@@ -170,6 +170,32 @@ class Record:
             named_classes(self.hyperparams.get(name) or [], base)
 
 
+def evaluated(name: str, value: Any) -> str:
+    """Write a hyper-parameter as the text that rl_zoo3 evaluates, such as ``{'activation_fn': th.nn.ReLU}``.
+
+    :raises ValueError: for one that it does not evaluate, and for what has no name there
+    """
+    if name not in EVALUATED:
+        raise ValueError(f"{name} is {value!r:.100}, and rl_zoo3 evaluates no text of it.")
+    return _as_code(value, name)
+
+
+def _as_code(value: Any, where: str) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key!r}: {_as_code(item, where)}" for key, item in value.items()) + "}"
+    if isinstance(value, (list, tuple)):
+        inner = ", ".join(_as_code(item, where) for item in value)
+        return f"[{inner}]" if isinstance(value, list) else f"({inner}{',' * bool(value)})"
+    if isinstance(value, type):
+        module, _, name = as_data(value, where)["@"][0].rpartition(".")
+        if not module:
+            raise ValueError(f"{where} holds {value!r}, which rl_zoo3 has no name for.")
+        return f"{module.replace('torch', 'th', 1)}.{name}"
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return repr(value)
+    raise ValueError(f"{where} holds {value!r:.100}, which no text stands for.")
+
+
 def options_of(args: argparse.Namespace) -> dict[str, Any]:
     """Return what a resume keeps of rl_zoo3's parsed command line."""
     return {name: value for name, value in vars(args).items() if name in _OPTIONS}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import shlex
@@ -57,6 +58,11 @@ class LoadedRun:
     changes: dict[str, Any] = field(default_factory=dict)
     """what its run changes in the task but the observation delay: arguments of ours, and those of other wrappers and of
     ``gymnasium.make`` by their names"""
+
+    @property
+    def setting(self) -> str:
+        """``changes`` as text."""
+        return json.dumps(self.changes, sort_keys=True, default=repr)
 
     def play(self, n_episodes: int, seed: int, n_envs: int = 1, age_error: int = 0, **kwargs: Any) -> Rollout:
         """Play whole episodes, see :func:`~sb3_said.evaluation.rollout`.

@@ -104,7 +104,7 @@ def main(argv: list[str] | None = None) -> None:
     if run.resume is not None and len(argv) <= 2 and (run.resume / ENDED_NAME).is_file():  # nothing else is asked for
         print(
             f"{run.resume} has ended, and nothing is left to do. sb3-said evaluate {run.resume} plays its agent. With "
-            "-n STEPS, or another setting, --resume trains it for longer."
+            "-n and more steps than it had, --resume trains it for longer."
         )
         return
     if "--help" in zoo_argv:

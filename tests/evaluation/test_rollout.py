@@ -141,7 +141,17 @@ def test_below_wrappers_that_change_rewards_a_monitor_counts_the_tasks_own() -> 
     returns, lengths = by_hand(5)
     changed, own = (rollout(Model(), make_env, 5, SEED, 2).returns for make_env in made)
     np.testing.assert_allclose(changed, 7.0 * np.array(lengths))
-    np.testing.assert_allclose(own, returns, atol=1e-5)
+    np.testing.assert_allclose(own, returns)
+
+
+def test_a_monitor_counts_also_where_a_wrapper_above_it_ends_the_episode() -> None:
+    def make(factor: float) -> gym.Env[Any, Any]:
+        env = gym.wrappers.TransformReward(Monitor(Countdown()), lambda reward: factor * float(reward))
+        return gym.wrappers.TimeLimit(env, 2)
+
+    own, changed = (rollout(Model(), lambda factor=factor: make(factor), 5, SEED, 2) for factor in (1.0, 7.0))
+    assert own.lengths.max() == 2 and own.returns.all()
+    np.testing.assert_array_equal(changed.returns, own.returns)
 
 
 @pytest.mark.parametrize("own", [7, {"level": 2}])

@@ -1,7 +1,9 @@
 """sb3-said card: what stands in it is what was measured of that very file."""
 
+import argparse
 import hashlib
 import json
+import shlex
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,11 +11,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch as th
 
 pytest.importorskip("rl_zoo3")
 
 from huggingface_hub import ModelCard
+from rl_zoo3 import exp_manager
+from rl_zoo3.utils import StoreDict
 from small_run import ENV, write_run
+from stable_baselines3.common.utils import LinearSchedule
+from trained_run import train_run
 
 from sb3_said import SAID
 from sb3_said.zoo import card, decide, evaluate, over_delays
@@ -77,6 +84,39 @@ def test_the_command_makes_the_agent_again_whatever_the_preset_says_since() -> N
                     options={"trained_agent": "old.zip"}, env_kwargs={"forward_reward_weight": 2.0})  # fmt: skip
     command = card.made_by(record, SimpleNamespace(gamma=0.99, planner_kwargs={"depth": 2}))
     assert command.endswith("-i old.zip --seed 1 -params gamma:0.99 --env-kwargs forward_reward_weight:2.0")
+
+
+def test_the_command_of_settings_with_classes_makes_them_again(tmp_path: Path) -> None:
+    classes = {"activation_fn": th.nn.Tanh, "net_arch": [16], "optimizer_class": th.optim.AdamW}
+    hyperparams = {"n_timesteps": 5e5, "policy_kwargs": classes, "replay_buffer_kwargs": {"x": [th.nn.ReLU, (1, 2)]}}
+    record = Record("sadr", "Pendulum-v1", 3, 2, hyperparams=hyperparams, missing={"env_wrapper": "a lambda"})
+    command, _, left_out = card.made_by(record).partition("  # ")
+    assert left_out == "and env_wrapper, which no command line holds"
+    words = shlex.split(command)
+    parser = argparse.ArgumentParser()
+    parser.add_argument("-params", nargs="+", action=StoreDict)
+    given = parser.parse_args(words[words.index("-params") :]).__dict__["params"]
+    read = {name: eval(text, vars(exp_manager)) for name, text in given.items()}
+    assert read == {name: hyperparams[name] for name in ("policy_kwargs", "replay_buffer_kwargs")}
+    schedule = replace(record, missing={}, hyperparams={"n_timesteps": 5e5, "learning_rate": LinearSchedule(1, 0, 1)})
+    assert card.made_by(schedule).endswith("  # and learning_rate, which no command line holds")
+
+
+def test_an_agent_of_normalised_observations_says_how_to_read_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = train_run(tmp_path, "sadr", "normalize:dict(norm_obs_keys=['observation'])")
+    played = load_run(folder, device="cpu")
+    results: Any = SimpleNamespace(settings={"n_episodes": 1, "seed": 0})
+    facts = card.describe(played, Record.read(folder), results, [], [], None, 0)
+    assert f"| belongs beside it | `{ENV}.normalize.zip` |" in facts
+    code, env = facts.split("```")[1].removeprefix("python\n"), played.make_env()
+    names: dict[str, Any] = {"make_env": played.make_env, "observation": env.reset(seed=3)[0]}
+    monkeypatch.chdir(folder)
+    exec(code, names)
+    assert played.normalize is not None
+    batch = played.normalize({key: value[None] for key, value in env.reset(seed=3)[0].items()})
+    np.testing.assert_array_equal(names["action"], played.model.predict(batch, deterministic=True)[0][0])
 
 
 def test_the_command_has_the_budget_wherever_it_was_given() -> None:

@@ -19,6 +19,7 @@ from small_run import ENV, write_run
 from small_task import Drift
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from trained_run import train_run
 
 from sb3_said import DelayedObservationWrapper, DelayedSAC
 from sb3_said.offline import Dataset, load_dataset
@@ -191,6 +192,19 @@ def own_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     yield "own_package"
     gym.registry.pop("Own-v0", None)
     sys.modules.pop("own_package", None)
+
+
+def test_a_changed_task_is_said(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    changed = train_run(tmp_path, "sadr", options=["--env-kwargs", "reset_noise_scale:0.2"])
+    collected(tmp_path / "a.npz", changed, "random", "--steps", "20")
+    about = json.loads(str(np.load(tmp_path / "a.npz")["about"]))
+    assert about["changes"] == {"env_kwargs": {"reset_noise_scale": 0.2}}
+    assert f'of {ENV} changed by {{"env_kwargs": {{"reset_noise_scale": 0.2}}}}' in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        collected(tmp_path / "b.npz", changed, run, "--steps", "20")
+    assert "the agents change theirs differently" in capsys.readouterr().err
+    collected(tmp_path / "c.npz", run, "--steps", "20")
+    assert "changed by" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("agent", ["random", "sac.zip"])

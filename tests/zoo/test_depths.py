@@ -129,6 +129,17 @@ def test_planners_of_another_training_are_refused(run, tmp_path):
         make(run, tmp_path, 4).put(2)
 
 
+def test_planners_of_another_run_are_refused_whose_settings_are_the_same(run, tmp_path):
+    (tmp_path / "other").mkdir()
+    model = SAID.load(run / "agent.zip", device="cpu")
+    with th.no_grad():
+        next(model.policy.actor.parameters()).add_(1e-3)  # as it would be of another task's
+    model.save(tmp_path / "other" / "agent.zip")
+    make(run, tmp_path, 2).train([2])
+    with pytest.raises(ValueError, match=r"agent was \w{8} and is now \w{8}.*into another folder"):
+        make(tmp_path / "other", tmp_path, 2).put(2)
+
+
 def test_a_replay_of_another_step_is_refused(run, tmp_path):
     planners = make(run, tmp_path)
     planners.model.num_timesteps += 1

@@ -136,6 +136,16 @@ def test_results_of_another_file_are_kept_apart(run: Path, tmp_path: Path) -> No
         assert Path(json.loads((folder / f"{name}.json").read_text())["file"]).stem == file
 
 
+@pytest.mark.parametrize("held", ['{"env": "Hopper-v5", "cells": []}', "3", "notes"])
+def test_a_file_of_something_else_is_not_written_over(
+    held: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (file := tmp_path / "returns.json").write_text(held)
+    with pytest.raises(SystemExit):
+        evaluate.main([str(run), "--episodes", "1", "--device", "cpu", "--json", str(file)])
+    assert "returns.json holds something else than what" in capsys.readouterr().err and file.read_text() == held
+
+
 def test_a_shorter_delay_keeps_the_length_of_the_action_history(run: Path) -> None:
     loaded = load_run(run, delay=1, device="cpu")
     env = loaded.make_env()

@@ -247,6 +247,46 @@ def test_a_changed_agent_is_played_again(said: Path, tmp_path: Path, monkeypatch
     assert by_cell(new)["a expert", 0] == by_cell(old)["a expert", 0]
 
 
+def test_an_agent_of_another_folder_is_no_changed_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both are named by the same relative path."""
+    file = tmp_path / "out.json"
+    for seed, label in enumerate(("first", "second")):
+        write_run(tmp_path / label / "run", DelayedSAC, 1, seed=seed)
+        monkeypatch.chdir(tmp_path / label)
+        document = play(file, [f"{label}=run"], ["0"])
+    assert [*by_cell(document)] == [("second", 0), ("first", 0)]
+
+
+def test_calls_that_add_to_one_file_at_a_time_lose_nothing(said: Path, sadr: Path, tmp_path: Path, monkeypatch) -> None:
+    file = tmp_path / "out.json"
+    original = over_delays.play
+
+    def meanwhile(cell: Cell, *how: Any) -> Summary:
+        if cell.agent == "one planner":
+            with monkeypatch.context() as patch:
+                patch.setattr(over_delays, "play", original)
+                play(file, [f"other={sadr}"], ["0"])
+                play(file, [f"one={said}"], ["1"], "--answer", "expert")
+        return original(cell, *how)
+
+    monkeypatch.setattr(over_delays, "play", meanwhile)
+    document = play(file, [f"one={said}"], ["1"])
+    assert {*by_cell(document)} == {("one planner", 1), ("one expert", 1), ("other", 0)}
+    for cell in document["cells"]:
+        words = document["origins"][cell["origin"]]
+        assert words.keys() >= {"command", "date"} and cell["result"]["returns"]
+    monkeypatch.undo()
+    alone = play(tmp_path / "alone.json", [f"one={said}", f"other={sadr}"], ["0", "1"])
+    assert by_cell(document).items() <= by_cell(alone).items()
+
+
+def test_runs_of_one_folder_name_need_labels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    runs = [write_run(tmp_path / name / "said" / "run_1", DelayedSAC, 1, seed=i) for i, name in enumerate("ab")]
+    with pytest.raises(SystemExit):
+        play(tmp_path / "out.json", [*runs], ["1"])
+    assert f"would both be called said/run_1: give each its own label, as in LABEL={runs[1]}" in capsys.readouterr().err
+
+
 def test_an_agent_of_a_plain_run_is_its_file(said: Path, tmp_path: Path) -> None:
     (copy := tmp_path / "alone.zip").write_bytes((said / f"{ENV}.zip").read_bytes())
     digests = {over_delays.digest_of(load_run(path, device="cpu")) for path in (said, copy)}

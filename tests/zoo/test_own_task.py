@@ -74,6 +74,16 @@ def test_a_task_without_a_delay_is_said_loudly(tmp_path: Path, capsys: pytest.Ca
     assert load_run(tmp_path / "sadr" / "Pendulum-v1-seed3_2", device="cpu").info["delay"] == 1
 
 
+def test_a_task_that_is_registered_with_its_delay_has_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    gym.register("Late-v0", lambda: DelayedObservationWrapper(Drift(), delay=2), max_episode_steps=12)
+    try:
+        train_here(tmp_path, f"--algo sadr --env Late-v0 {QUICK}")
+        assert "NO DELAY" not in capsys.readouterr().out
+        assert load_run(tmp_path / "sadr" / "Late-v0-seed3_1", device="cpu").info["delay"] == 2
+    finally:
+        gym.registry.pop("Late-v0")
+
+
 def test_a_task_may_have_a_dot_in_its_name(tmp_path: Path) -> None:
     gym.register("Arm.Reach-v1", lambda: gym.make("Pendulum-v1").unwrapped, max_episode_steps=200)
     try:

@@ -210,7 +210,10 @@ def test_a_refused_resume_leaves_the_run_as_it_was(
     assert message in f"{stop.value} {capsys.readouterr().err}"
     assert json.loads((copy / "run.json").read_text()) == before
     train.main(["--resume", str(copy)])
+    assert "nothing is left to do" in capsys.readouterr().out
     assert_same_agents(finished, copy)
+    train.main(["--resume", str(copy), "-n", "240"])
+    assert SAID.load(copy / f"{ENV}.zip").num_timesteps == 240 and (copy / ENDED_NAME).is_file()
 
 
 def test_a_file_s_settings_reach_the_evaluations_and_stay_beside_those_given(
@@ -351,11 +354,14 @@ def test_the_expert_can_learn_under_another_delay(tmp_path: Path, monkeypatch: p
         ("--num-threads 0", "--num-threads must be at least 1, got 0"),
         ("-conf {}/broken.yml", "broken.yml is no YAML"),
         ("-conf {}/list.yml", "list.yml holds a list, expected settings by task"),
+        ("-conf {}/empty.yml", "empty.yml holds nothing, expected settings by task, such as Pendulum-v1: {n_timesteps"),
+        ("-conf {}/bare.yml", "bare.yml holds nothing, expected settings by task"),
     ],
 )
 def test_says_what_is_wrong(words: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "broken.yml").write_text("a: [1")
-    (tmp_path / "list.yml").write_text("- a")
+    for name, text in {"list": "- a", "empty": "", "bare": "Pendulum-v1:"}.items():
+        (tmp_path / f"{name}.yml").write_text(text)
     with pytest.raises(SystemExit) as stop:
         train.main(["--env", "Pendulum-v1", "-f", str(tmp_path), *words.format(tmp_path).split()])
     assert stop.value.code == 2 and message in capsys.readouterr().err

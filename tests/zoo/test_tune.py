@@ -17,6 +17,8 @@ import torch as th
 pytest.importorskip("rl_zoo3")
 pytest.importorskip("scipy")
 
+from rl_zoo3 import exp_manager
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from trained_run import ENV, config_of, read_by_train, train_run, train_said
 
 from sb3_said import SAID, PlannerConfig
@@ -215,6 +217,20 @@ def test_says_what_is_wrong(run: Path, arguments: list[str], message: str, capsy
     assert exit_info.value.code == 2 and message in capsys.readouterr().err
 
 
+def test_another_runs_trials_are_not_its_own(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Though both have the same settings and their studies the same name."""
+    other = Path(shutil.copytree(run, tmp_path / "logs" / "run"))
+    model: Any = load_run(other, device="cpu").model
+    with th.no_grad():
+        next(model.policy.actor.parameters()).add_(1e-3)
+    model.save(other / f"{ENV}.zip")
+    search = ["--depths", "1", "--temperatures", "0", "--storage", str(tmp_path / "shared.log"), *QUICK]
+    tune.main([str(run), *search])
+    with pytest.raises(SystemExit):
+        tune.main([str(other), *search])
+    assert "agent was" in (error := capsys.readouterr().err) and "begin another study with --study-name" in error
+
+
 def test_folders_that_cannot_be_tuned(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for folder, message in (
         (tmp_path / "nowhere", "does not exist"),
@@ -231,9 +247,11 @@ def test_folders_that_cannot_be_tuned(run: Path, tmp_path: Path, capsys: pytest.
 
 def test_what_yaml_cannot_hold_is_named() -> None:
     given = {"policy_kwargs": {"activation_fn": th.nn.Tanh}, "gamma": 0.9, "train_freq": (1, "step")}
+    given |= {"learning_rate": lambda left: 1e-3 * left, "replay_buffer_kwargs": {"x": FlattenExtractor}}
     record = Record(
         "said", ENV, env_kwargs={"healthy_reward": 2.0}, hyperparams=given, missing={"callback": "a lambda"}
     )
     block, left_out = plain_settings(record)
+    assert eval(block.pop("policy_kwargs"), vars(exp_manager)) == given["policy_kwargs"]  # as rl_zoo3 does
     assert block == {"gamma": 0.9, "train_freq": [1, "step"], "env_kwargs": {"healthy_reward": 2.0}}
-    assert left_out == ["callback", "policy_kwargs"]
+    assert left_out == ["callback", "learning_rate", "replay_buffer_kwargs"]
