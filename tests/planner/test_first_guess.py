@@ -90,7 +90,7 @@ def test_it_learns_a_linear_system_and_its_behaviour():
     windows = source.sample(2_000, L, generator)
     normalizer.fit_moves(windows)
     guess = make_guess()
-    fit_first_guess(guess, source, normalizer, PlannerConfig(weight_factor=0.0), 300, generator)
+    fit_first_guess(guess, source, normalizer, PlannerConfig(weight_factor=0.0), 150, generator)
     reaches = windows.valid[:, D]
     states, actions = windows.states[reaches], windows.actions[reaches]
     n = len(states)
@@ -113,7 +113,7 @@ def test_the_clone_does_what_weighs_more_and_moves_are_the_data_s():
     normalizer.fit(source.start_states(), source.start_actions())
     normalizer.fit_moves(source.sample(1_000, L, generator))
     guess = make_guess()
-    fit_first_guess(guess, source, normalizer, PlannerConfig(weight_factor=3.0), 300, generator)
+    fit_first_guess(guess, source, normalizer, PlannerConfig(weight_factor=3.0), 150, generator)
     assert th.equal(guess.model.move_std, normalizer.move_std[0]) and not th.allclose(guess.model.move_std, th.ones(2))
     with th.no_grad():
         done = guess.clone(normalizer.normalize_states(source.start_states())).mean()
@@ -134,7 +134,7 @@ def test_older_steps_teach_the_model_and_not_the_clone():
     errors, clones = {}, {}
     for name, given_older in (("newest alone", None), ("both", older)):
         guess, generator = make_guess(), th.Generator().manual_seed(0)
-        fit_first_guess(guess, newest, normalizer, PlannerConfig(), 300, generator, older=given_older)
+        fit_first_guess(guess, newest, normalizer, PlannerConfig(), 100, generator, older=given_older)
         states, actions = (2 * th.rand(500, n, generator=generator) - 1 for n in (STATE_DIM, ACTION_DIM))
         with th.no_grad():
             z = normalizer.normalize_states(states)
