@@ -207,7 +207,10 @@ class SafeSaveMixin(OffPolicyAlgorithm):
         saved = load_tree(path, kind=None)
         with readable(path, explained=(ValueError,)):
             self._check_file(saved)
+            n_updates = saved["counters"]["_n_updates"]
+            check_numbers("_n_updates", n_updates)
             _take_parameters(self, _fitting_parameters(self, saved["parameters"], exact_match), exact_match)
+            self._n_updates = max(self._n_updates, int(n_updates))  # that made them; a compact file shows no others
 
     @classmethod
     def _check_argument(cls, name: str, value: Any, policy_class: type) -> None:
@@ -238,6 +241,12 @@ class SafeSaveMixin(OffPolicyAlgorithm):
         """Look at a file whose parameters are about to be taken over; an algorithm may refuse it.
 
         :raises ValueError: for one that does not go with this agent
+        """
+
+    def _take_settings(self, saved: dict[str, Any]) -> None:
+        """Take over those settings of a checkpoint that training may have changed, before its parameters.
+
+        :raises ValueError: for settings that do not go with this agent
         """
 
     def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_said.files.agents import SafeSaveMixin, agent_state, restore_agent
 from sb3_said.files.archive import SavedFileError, load_tree, readable, save_tree
+from sb3_said.files.arguments import as_data
 from sb3_said.files.normalization import check_statistics, get_statistics, set_statistics
 
 CHECKPOINT_NAME = "checkpoint.zip"
@@ -167,6 +168,7 @@ def training_state(
     """
     return {
         **agent_state(model),
+        "settings": {name: as_data(getattr(model, name), name) for name in model.settings_arguments},
         "replay_buffer": _replay_buffer(model).state_dict() if keeps_replay else {"checksum": checksum(model)},
         "vec_normalize": get_statistics(model.get_vec_normalize_env()),
         "evaluations": evaluations_of(callback),
@@ -237,6 +239,7 @@ def restore_training(model: SafeSaveMixin, path: str | Path, callback: BaseCallb
         is_dataset = "checksum" in state["replay_buffer"]
         if is_dataset and state["replay_buffer"]["checksum"] != checksum(model):
             raise ValueError("it is of a training on other data; resume with the dataset of the run")
+        model._take_settings(state)
         restore_agent(model, state)
         if not is_dataset:
             replay_buffer.load_state_dict(state["replay_buffer"])

@@ -27,6 +27,11 @@ class ZScored(nn.Module):
         self.register_buffer("mean", th.zeros(n))
         self.register_buffer("std", th.ones(n))
 
+    @property
+    def has_learned(self) -> bool:
+        """Whether it was scaled to what it learned from."""
+        return bool((self.mean != 0).any() or (self.std != 1).any())
+
     @th.no_grad()
     def scale_to(self, rows: th.Tensor) -> None:
         """Take over how rows (M, n) are spread; an entry that never varies keeps its scale."""

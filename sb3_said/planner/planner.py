@@ -241,15 +241,7 @@ class InpaintingPlanner(nn.Module):
         config, device = self.config, self.device
         observation, action_history, delay = self._checked(observation, action_history, delay)
         n, delay = len(observation), self._trained_delay(delay, action_history)
-        extra_states: tuple[th.Tensor, ...] = ()
-        if config.extra_state_probability > 0:
-            shape = (n, self.max_delay, self.obs_dim)
-            extra_states = checked_extra_states(state_history, state_known, shape, device)
-        elif state_history is not None or state_known is not None:
-            raise ValueError(
-                "This planner is not trained with extra known states; build and train it with "
-                "PlannerConfig(extra_state_probability=0.5), or leave state_history and state_known out."
-            )
+        extra_states = self._extra_states(n, state_history, state_known)
         shortest, longest = int(delay.min()), int(delay.max())
         is_recorded = self._can_be_recorded(value_fn)
         # A decision costs what its age costs; but on a GPU hardly less, and one graph serves all ages
@@ -292,21 +284,30 @@ class InpaintingPlanner(nn.Module):
         return plan
 
     @th.no_grad()
-    def guess(self, observation: th.Tensor, action_history: th.Tensor, delay: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def guess(
+        self,
+        observation: th.Tensor,
+        action_history: th.Tensor,
+        delay: th.Tensor,
+        state_history: th.Tensor | None = None,
+        state_known: th.Tensor | None = None,
+    ) -> tuple[th.Tensor, th.Tensor]:
         """Return what the first guess says by itself: the present (B, obs_dim), and an action (B, act_dim) in [-1, 1].
 
-        :param observation: (B, obs_dim); this and the next two as of :meth:`plan`
+        :param observation: (B, obs_dim); this and the next four as of :meth:`plan`
         :param action_history: (B, D, act_dim)
         :param delay: (B,)
-        :raises ValueError: for wrong shapes, numbers that are not finite, delays outside 0..max_delay, or a planner
-            without a first guess
+        :param state_history: (B, D, obs_dim)
+        :param state_known: (B, D)
+        :raises ValueError: as :meth:`plan`, and for a planner without a first guess
         """
         if self.first_guess is None:
             raise ValueError("This planner has no first guess; build it with another first_guess than 'none'.")
         observation, action_history, delay = self._checked(observation, action_history, delay)
         length = int(delay.max()) + self.config.horizon
-        given = inpainting.known_window(observation, action_history, delay, length)
-        known = inpainting.known_mask(delay, length, self.obs_dim, self.act_dim)
+        history, is_known = self._extra_states(len(delay), state_history, state_known) or (None, None)
+        given = inpainting.known_window(observation, action_history, delay, length, history)
+        known = inpainting.known_mask(delay, length, self.obs_dim, self.act_dim, is_known)
         states, actions = self._guess_window(given, known, delay)
         rows = th.arange(len(delay), device=self.device)
         return states[rows, delay], actions[rows, delay]
@@ -322,6 +323,23 @@ class InpaintingPlanner(nn.Module):
         n = len(observation)
         action_history = finite_tensor("action_history", action_history, (n, self.max_delay, self.act_dim), self.device)
         return observation, action_history, checked_delay(delay, n, self.max_delay).to(self.device)
+
+    def _extra_states(
+        self, n: int, state_history: th.Tensor | None, state_known: th.Tensor | None
+    ) -> tuple[()] | tuple[th.Tensor, th.Tensor]:
+        """Return the extra known states of n decisions, (n, D, obs_dim) and (n, D) bool; none of a planner without.
+
+        :raises ValueError: for wrong shapes, and for extra states that the network was not trained with
+        """
+        if self.config.extra_state_probability > 0:
+            shape = (n, self.max_delay, self.obs_dim)
+            return checked_extra_states(state_history, state_known, shape, self.device)
+        if state_history is not None or state_known is not None:
+            raise ValueError(
+                "This planner is not trained with extra known states; build and train it with "
+                "PlannerConfig(extra_state_probability=0.5), or leave state_history and state_known out."
+            )
+        return ()
 
     def _can_be_recorded(self, value_fn: ValueFn | None) -> bool:
         return self.device.type == "cuda" and (value_fn is None or isinstance(_owner(value_fn), nn.Module))

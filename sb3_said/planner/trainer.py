@@ -259,7 +259,8 @@ class PlannerTrainer:
         :param callback: called with the trainer after every update; training stops when it returns False
         :raises FloatingPointError: when an update was not finite; the planner stays as it was
         """
-        for _ in range(self.gradient_steps - self.n_updates if n_steps is None else n_steps):
+        n_left = self.gradient_steps - self.n_updates
+        for _ in range(n_left if n_steps is None else min(n_steps, n_left)):
             self.step()
             if callback is not None and callback(self) is False:
                 break

@@ -8,6 +8,8 @@ from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_said.said.learning import check_intervals
+
 
 class PlannerTrainingCallback(BaseCallback):
     """Train SAID's planner when learning ends, and every ``planner_train_freq`` steps where the agent asks for it.
@@ -22,6 +24,7 @@ class PlannerTrainingCallback(BaseCallback):
     :param intervals: in updates, ``log_interval``, ``eval_interval`` or ``save_interval`` of
         :meth:`~sb3_said.said.SAID.train_planner`
     :raises TypeError: for another name
+    :raises ValueError: for an interval below 1
     """
 
     model: Any  # SAID, whose module imports this one
@@ -32,11 +35,12 @@ class PlannerTrainingCallback(BaseCallback):
         progress_bar: bool = False,
         verbose: int = 0,
         should_stop: Callable[[], bool] | None = None,
-        **intervals: int,
+        **intervals: int | None,
     ):
         super().__init__(verbose)
         if unknown := sorted(set(intervals) - {"log_interval", "eval_interval", "save_interval"}):
             raise TypeError(f"PlannerTrainingCallback has no argument {', '.join(unknown)}.")
+        check_intervals(**intervals)  # and not when the planner is trained, after all of learn()'s steps
         self.how: dict[str, Any] = {"folder": folder, "progress_bar": progress_bar, "should_stop": should_stop}
         self.how |= intervals
 

@@ -34,7 +34,7 @@ def to_onnx(model: SAID) -> Any:
     except ImportError as error:
         raise ImportError('onnx is missing, which export needs: pip install "sb3_said[export]"') from error
     policy, student = model.policy, model.policy.student
-    if student is None:
+    if student is None or not student.has_learned:
         raise ValueError(
             "This agent has no student to export. In Python: model = SAID.load(file, env=env); model.distill(); "
             "model.save(file)."

@@ -41,7 +41,6 @@ class PlannerLearner(OfflineAlgorithm):
     planner_ways: dict[str, dict[str, Any]]
     value: Value
     _planner_trained_at: int  # num_timesteps of the last planner training
-    _expert_is_given: bool  # by a file of set_parameters
 
     def make_planner_trainer(
         self, gradient_steps: int | None = None, planner: InpaintingPlanner | None = None
@@ -50,9 +49,10 @@ class PlannerLearner(OfflineAlgorithm):
 
         :param gradient_steps: ``planner_gradient_steps`` by default
         :param planner: in place of the agent's own, one of the same sizes
-        :raises ValueError: when the buffer is empty, as it is after ``load``
+        :raises ValueError: when the buffer is empty, as it is after ``load``, or the scale of its states is missing
         """
         steps = self.planner_gradient_steps if gradient_steps is None else whole("gradient_steps", gradient_steps)
+        self._check_scale()
         replay, newest, env = self.replay_buffer, self.newest_fraction, self._vec_normalize_env
         source = replay.window_source(newest, env)
         has_older = len(source) < replay.size() * replay.n_envs  # a log's replay has one, whatever the agent has
@@ -72,7 +72,7 @@ class PlannerLearner(OfflineAlgorithm):
         gradient_steps: int | None = None,
         folder: str | Path | None = None,
         progress_bar: bool = False,
-        log_interval: int = 500,
+        log_interval: int | None = 500,
         eval_interval: int = 2_000,
         save_interval: int | None = None,
         trial_episodes: int | None = None,
@@ -93,16 +93,20 @@ class PlannerLearner(OfflineAlgorithm):
         :param gradient_steps: ``planner_gradient_steps`` by default
         :param folder: keep a checkpoint there, and continue from it if it is of the same training
         :param progress_bar: show one
-        :param log_interval: updates between two rows of losses in the log
+        :param log_interval: updates between two rows of losses in the log; None for one, at the end
         :param eval_interval: updates between two measurements of the held-out errors, beside the regression's
         :param save_interval: updates between two checkpoints; by default ten minutes, and longer where they are large
         :param trial_episodes: ``planner_trial_episodes`` by default; none are played where there is no environment, or
             no expert to compare with
         :param should_stop: asked after every update; where it says so, a checkpoint is written and the training ends
         :raises KeyboardInterrupt: when ``should_stop`` has ended the training
-        :raises ValueError: when the buffer is empty, or the checkpoint is of a training with other settings
+        :raises ValueError: for an interval below 1, when the buffer is empty, or the checkpoint is of a training with
+            other settings
         :raises FloatingPointError: when an update was not finite
         """
+        check_intervals(log_interval=log_interval, eval_interval=eval_interval, save_interval=save_interval)
+        n_episodes = self.planner_trial_episodes if trial_episodes is None else trial_episodes
+        n_episodes = whole("trial_episodes", n_episodes, least=0)
         learned_online = not self.replay_buffer.holds_logs  # of logs num_timesteps counts updates
         if learned_online and not self.has_expert and 0 < self.num_timesteps <= self.learning_starts:
             warnings.warn(
@@ -113,7 +117,6 @@ class PlannerLearner(OfflineAlgorithm):
         if not hasattr(self, "_logger"):  # not set_logger: learn() makes its own
             self._logger = configure_logger(self.verbose, self.tensorboard_log, "SAID", reset_num_timesteps=False)
 
-        n_episodes = self.planner_trial_episodes if trial_episodes is None else trial_episodes
         is_tried = n_episodes > 0 and self._can_be_tried()
 
         def train(planner: InpaintingPlanner, *before: InpaintingPlanner) -> tuple[PlannerTraining, str]:
@@ -150,12 +153,12 @@ class PlannerLearner(OfflineAlgorithm):
             raise KeyboardInterrupt
         self._planner_trained_at = self.num_timesteps
 
-    def learn_offline(  # type: ignore[override]  # the planner has its own number of updates, logs and checkpoints
+    def learn_offline(  # the planner has its own number of updates, logs and checkpoints
         self: SelfLearner,
         dataset: Any,
         gradient_steps: int | None = None,
         callback: MaybeCallback = None,
-        log_interval: int = 500,
+        log_interval: int | None = 500,
         tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
@@ -172,7 +175,7 @@ class PlannerLearner(OfflineAlgorithm):
         :param dataset: whatever :func:`~sb3_said.offline.load_dataset` reads; None for what ``take_dataset`` took
         :param gradient_steps: ``planner_gradient_steps`` by default
         :param callback: SB3 callbacks, such as ``EvalCallback``
-        :param log_interval: updates between two rows of losses in the log
+        :param log_interval: updates between two rows of losses in the log; None for one, at the end
         :param tb_log_name: name of the run in TensorBoard
         :param reset_num_timesteps: has no effect: each training of a planner begins anew
         :param progress_bar: show one
@@ -184,6 +187,7 @@ class PlannerLearner(OfflineAlgorithm):
         :raises ValueError: as ``load_dataset`` and :meth:`train_planner` do
         """
         total = self.planner_gradient_steps if gradient_steps is None else whole("gradient_steps", gradient_steps)
+        check_intervals(log_interval=log_interval, eval_interval=eval_interval, save_interval=save_interval)
         with self._as_before_if_it_fails():
             ways_of(self.planner_ways, self.policy.planner.config.to_dict(), "iql")  # refuses what V(s) cannot score
             watcher = self._begin_offline(dataset, total, callback, tb_log_name, True, progress_bar)
@@ -218,7 +222,7 @@ class PlannerLearner(OfflineAlgorithm):
     @property
     def has_expert(self) -> bool:
         """Whether actor and critics have learned, here or where ``set_parameters`` has them from."""
-        return self._n_updates > 0 or len(self.actor.optimizer.state) > 0 or self._expert_is_given
+        return self._n_updates > 0 or len(self.actor.optimizer.state) > 0
 
     @property
     def newest_fraction(self) -> float:
@@ -246,6 +250,14 @@ class PlannerLearner(OfflineAlgorithm):
             sizes = data.states.shape[1], data.actions.shape[1]
             values = ImplicitValues(*sizes, self.policy.iql_config).to(self.device)
         return IQL(values, data, self.gamma, self.seed or 0)
+
+    def _check_scale(self) -> None:
+        """:raises ValueError: where the agent reads normalised states, and nothing normalises those of its replay"""
+        if self.reads_normalized and self._vec_normalize_env is None:
+            raise ValueError(
+                "This agent reads observations that VecNormalize has normalised, and its replay has them as they are: "
+                "give load(..., env=...) what load_normalization(path, venv) or SB3's VecNormalize.load returns."
+            )
 
     def _can_be_tried(self) -> bool:
         """Tell whether planner and expert can be played. Warn where the planner cannot, or episodes might never end."""
@@ -278,6 +290,13 @@ class PlannerLearner(OfflineAlgorithm):
                 setattr(self, name, value)
             policy.values, policy.planner.config = values, config
             raise
+
+
+def check_intervals(**intervals: int | None) -> None:
+    """:raises ValueError: for one that is given and below 1, or no whole number"""
+    for name, interval in intervals.items():
+        if interval is not None:
+            whole(name, interval)
 
 
 def whole(name: str, given: float, least: int = 1) -> int:

@@ -143,7 +143,8 @@ class SAIDPolicy(DelayedSACPolicy):
     @property
     def answers(self) -> list[Answer]:
         """Who can answer ``predict``."""
-        can = {"planner": self.planner_is_trained, "expert": True, "student": self.student is not None}
+        has_student = self.student is not None and self.student.has_learned
+        can = {"planner": self.planner_is_trained, "expert": True, "student": has_student}
         can["both"] = self.planner_is_trained and self._ages_are_shared
         return [who for who in get_args(Answer) if can[who]]
 
@@ -236,7 +237,7 @@ class SAIDPolicy(DelayedSACPolicy):
             )
         if who in ("planner", "both") and not self.planner_is_trained:
             raise ValueError("The planner is not trained yet; call learn() or train_planner() first.")
-        if who == "student" and self.student is None:
+        if who == "student" and (self.student is None or not self.student.has_learned):
             raise ValueError("There is no student yet; call distill() first.")
 
     def value(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
@@ -311,7 +312,8 @@ class SAIDPolicy(DelayedSACPolicy):
         if not isinstance(observation, dict):
             return observation
         state, history, delay = (observation[key] for key in KEYS)
-        present, _ = self.planner.guess(state, history, delay[:, 0].long())
+        extra = {key: observation[key] for key in STATE_KEYS if key in observation}
+        present, _ = self.planner.guess(state, history, delay[:, 0].long(), **extra)
         return {**observation, "observation": present, "delay": th.zeros_like(delay)}
 
     def _is_experts(self, observation: PyTorchObs, who: Answer) -> th.Tensor:

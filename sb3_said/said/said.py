@@ -25,7 +25,7 @@ from sb3_said.said.callbacks import PlannerTrainingCallback
 from sb3_said.said.learning import PlannerLearner, whole
 from sb3_said.said.policies import Answer, SAIDPolicy, Value
 from sb3_said.said.student import Distillation, distill
-from sb3_said.said.ways import check_scored, ways_of
+from sb3_said.said.ways import WAY_SETTINGS, check_scored, ways_of
 
 SelfSAID = TypeVar("SelfSAID", bound="SAID")
 
@@ -51,8 +51,9 @@ class SAID(PlannerLearner, StableSAC):
         paper's Table 3 has -100, for tasks that end by falling, and the presets of such tasks have it too; None keeps
         the reward, for tasks that may end because they are done
     :param planner_trial_episodes: of the training environment, played after the planner's training, a quarter of them
-        in each of its ways to decide, the others in the three best, and all with the expert; the best one answers. They
-        come on top of ``learn``'s steps. 0: the planner answers, as ``planner_kwargs`` says
+        (at least one in each environment) in each of its ways to decide, the others in the three best, and all with the
+        expert; the best one answers. They come on top of ``learn``'s steps. 0: the planner answers, as
+        ``planner_kwargs`` says
     :param planner_ways: names and settings of :meth:`set_planner` to compare with those of ``planner_kwargs``, or a
         ``mask``, for which a second planner is trained; by default :data:`~sb3_said.said.ways.WAYS`, or none where
         ``planner_kwargs`` has settings of ``set_planner``. A planner of ``mask="own"`` is left out where not every age
@@ -61,7 +62,7 @@ class SAID(PlannerLearner, StableSAC):
         V(s) that is learned beside the planner by implicit Q-learning, which is what offline learning has
     :param iql_kwargs: fields of :class:`~sb3_said.offline.IQLConfig`, how that V(s) is learned, such as
         ``{"expectile": 0.9}``; the attribute has all of them
-    :param student_width: of the hidden layers of the student that :meth:`distill` trains; None before
+    :param student_width: of the hidden layers of the student that :meth:`distill` trains; None for its default
     :param sac_kwargs: every other argument of :class:`~sb3_said.sac.StableSAC`, the expert, and of SB3's ``SAC``
     :raises ValueError: as ``DelayedSAC`` does, for settings of planner or V(s) outside their range, and for a
         ``state_history`` in the observations that the planner is not trained to read or that ``VecNormalize`` leaves
@@ -109,7 +110,6 @@ class SAID(PlannerLearner, StableSAC):
         self.iql_kwargs = asdict(settings_of(IQLConfig, iql_kwargs, "IQL"))
         self.student_width = student_width
         self._planner_trained_at = 0
-        self._expert_is_given = False
         super().__init__(policy, env, learning_rate, **sac_kwargs)
 
     @property
@@ -152,14 +152,31 @@ class SAID(PlannerLearner, StableSAC):
     def _check_file(self, saved: dict[str, Any]) -> None:
         """Refuse a trained planner of other settings than this agent's, of which its weights mean something else."""
         super()._check_file(saved)
-        self._expert_is_given = saved["counters"]["_n_updates"] > 0
-        given, own = from_data(saved["arguments"].get("planner_kwargs", {})), self.planner_kwargs
-        others = [name for name in WEIGHT_SETTINGS if name in given and given[name] != own[name]]
-        if others and saved["parameters"]["policy"]["planner_updates"] > 0:
+        if saved["parameters"]["policy"]["planner_updates"] > 0:
+            self._check_weights(from_data(saved["arguments"].get("planner_kwargs", {})), WEIGHT_SETTINGS)
+
+    def _check_weights(self, given: dict[str, Any], names: Iterable[str]) -> None:
+        """:raises ValueError: where a trained planner has other settings than this agent's, of those named"""
+        own = self.planner_kwargs
+        others = {name: given[name] for name in names if name in given and given[name] != own[name]}
+        if others:
             raise ValueError(
-                f"its planner was trained with {', '.join(f'{name}={given[name]!r}' for name in others)}, and is asked "
-                f"for with {', '.join(f'{name}={own[name]!r}' for name in others)}. Leave these out, or train anew"
+                f"its planner was trained with {', '.join(f'{name}={value!r}' for name, value in others.items())}, and "
+                f"is asked for with {', '.join(f'{name}={own[name]!r}' for name in others)}. Make this agent with "
+                f"planner_kwargs={others}, take load() in place of set_parameters(), or train anew"
             )
+
+    def _take_settings(self, saved: dict[str, Any]) -> None:
+        """Decide as the planner of a checkpoint, whose trial may have chosen otherwise than the arguments of both."""
+        super()._take_settings(saved)
+        if not saved["parameters"]["policy"].get("planner_updates", 0):
+            return
+        given = from_data(saved.get("settings", {}).get("planner_kwargs", {}))
+        self._check_weights(given, [name for name in WEIGHT_SETTINGS if name != "mask"])
+        ways = {name: given[name] for name in WAY_SETTINGS if name in given}
+        config = settings_of(PlannerConfig, self.planner_kwargs | ways, "The planner")
+        if config != self.policy.planner.config:
+            self.policy.take_planner(self.policy.new_planner(config), config)
 
     def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:
         """Keep this agent's own planner where the given one was never trained and has other settings."""
@@ -271,21 +288,23 @@ class SAID(PlannerLearner, StableSAC):
             acts_at.append(0)  # on the present, as if it saw it
         return acts_at
 
-    def distill(self, width: int = 256, progress_bar: bool = False, **settings: Any) -> float:
+    def distill(self, width: int | None = None, progress_bar: bool = False, **settings: Any) -> float:
         """Train a student: a plain network that answers as the planner does at temperature 0, much faster.
 
         It learns from the planner's answers to observations of the replay, at every age, and to those that it visits
         itself in the training environment, within ten minutes on one core. ``save`` keeps it. To use it,
         ``set_answer("student")``. It does not change where the planner is trained again.
 
-        :param width: of its two hidden layers
+        :param width: of its two hidden layers; by default ``student_width``, or 256 where that is None
         :param progress_bar: show one
         :param settings: fields of :class:`~sb3_said.said.student.Distillation`, such as ``n_labels`` or ``q_weight``
         :return: root mean square of its error over held-out answers of the planner, in actions in [-1, 1]
-        :raises ValueError: without a trained planner, or without both a replay and an environment
+        :raises ValueError: without a trained planner, without both a replay and an environment, or where the scale of
+            the replay's states is missing
         """
-        config = Distillation(**settings)
+        config, width = Distillation(**settings), (self.student_width or 256) if width is None else width
         self.policy._check_answer("planner")
+        self._check_scale()
         if self.env is None and (self.replay_buffer is None or self.replay_buffer.size() == 0):
             raise ValueError("Nothing to learn from: the replay is empty, as after load(); give load(..., env=env).")
         before = self.policy.student

@@ -20,9 +20,15 @@ from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.trainer import PlannerTrainer, worse_than_regression
 
 PLANNER_CHECKPOINT_NAME = "planner_checkpoint.zip"
-SECOND_CHECKPOINT_NAME = "planner_{mask}_checkpoint.zip"  # of one of another mask than the agent was made with
+SECOND_CHECKPOINT_NAME = "planner_{mask}_checkpoint.zip"  # of one of another mask than the default's
 
 SAID = Any  # whose module imports this one
+
+
+def planner_checkpoint(folder: Path, mask: str) -> Path:
+    """Return where the training of a planner is kept: by its mask, as a trial may make another the agent's own."""
+    is_first = mask == PlannerConfig.mask
+    return folder / (PLANNER_CHECKPOINT_NAME if is_first else SECOND_CHECKPOINT_NAME.format(mask=mask))
 
 
 class PlannerTraining:
@@ -44,7 +50,7 @@ class PlannerTraining:
         value_trainer: IQL | None,
         row: Callable[[int], int],
         folder: str | Path | None,
-        log_interval: int,
+        log_interval: int | None,
         eval_interval: int,
         save_interval: int | None,
         watcher: BaseCallback | None = None,
@@ -54,10 +60,7 @@ class PlannerTraining:
         self.is_agents = trainer.planner is model.policy.planner  # or one beside it, for a trial
         mask = trainer.config.mask
         self.name = "planner" if self.is_agents else f"planner of mask={mask!r}"
-        # By mask, as a trial may have made the other planner the agent's own
-        first = model._given_planner_kwargs.get("mask", PlannerConfig.mask)
-        file = PLANNER_CHECKPOINT_NAME if mask == first else SECOND_CHECKPOINT_NAME.format(mask=mask)
-        self._clock = None if folder is None else CheckpointClock(Path(folder) / file)
+        self._clock = None if folder is None else CheckpointClock(planner_checkpoint(Path(folder), mask))
         self.watcher = watcher
         self._data = {"num_timesteps": model.num_timesteps, "replay": checksum(model)}
         self._weighed = {name: getattr(model, name) for name in ("gamma", "planner_terminal_penalty", "value")}
@@ -97,7 +100,7 @@ class PlannerTraining:
             done = trainer.n_updates
             is_end = done == total
             self._train_values()
-            if done % self.log_interval == 0 or is_end:
+            if is_end or (self.log_interval is not None and done % self.log_interval == 0):
                 bar.set_postfix(loss=self._log_row(done % self.eval_interval == 0 or is_end))
             goes_on = on_step is None or on_step(done)  # first: a checkpoint keeps what callbacks counted
             outcome = "stopped" if should_stop is not None and should_stop() else "done"

@@ -61,8 +61,8 @@ def play_trial(
 ) -> Trial:
     """Play the training environment with the planner, in each of its ways, and with the expert, from the same seeds.
 
-    All of them play the first quarter of the episodes. Then the three best ways, each with the expert at the ages at
-    which that does better, and the expert play on.
+    All of them play the first quarter of the episodes, in whole rounds of the environments. Then the three best ways,
+    each with the expert at the ages at which that does better, and the expert play on.
 
     These are environment steps beyond those of ``learn``. An expert that has not learned at age 0, as one of a fixed
     delay, does not try to act on a guessed present.
@@ -101,6 +101,8 @@ def play_trial(
     try:
         with model.borrowed_env() as env:
             n_first = n_episodes if len(ways) <= GO_ON else int(np.ceil(FIRST_PART * n_episodes))
+            # Environments, whose delays may differ, have their turns; else they would step on for those that play
+            n_first = min(n_episodes, int(np.ceil(n_first / env.num_envs)) * env.num_envs)
             play_on(env, [*everyone], n_first)
             if n_first < n_episodes:
                 shares = {name: best_share(returns[name], returns["expert"], _if_settled(ages))[0] for name in ways}

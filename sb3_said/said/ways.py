@@ -57,10 +57,7 @@ def ways_of(
             "own_ages": own.mask == "random",
         }
         ways = {name: way for name, way in WAYS.items() if is_another.get(name, True)}
-        if "own_ages" not in ways:
-            return ways
-        first = {"mask": own.mask, "present": own.present}  # also where the agent has the second's, later
-        return {name: {**first, **way} for name, way in ways.items()}
+        return _on_the_first(ways, own) if "own_ages" in ways else ways
     for name, settings in given.items():
         if len(name) > NAME_LENGTH:
             raise ValueError(f"planner_ways has the name {name!r}; expected at most {NAME_LENGTH} letters.")
@@ -71,7 +68,12 @@ def ways_of(
             )
         in_way(own, settings)
         check_scored(settings, value == "iql")
-    return given
+    return _on_the_first(given, own) if any("mask" in way for way in given.values()) else given
+
+
+def _on_the_first(ways: dict[str, dict[str, Any]], own: PlannerConfig) -> dict[str, dict[str, Any]]:
+    """Let ways be of the agent's first planner, but for those that say otherwise, also once it has the second's."""
+    return {name: {"mask": own.mask, "present": own.present, **way} for name, way in ways.items()}
 
 
 def in_way(own: PlannerConfig, settings: dict[str, Any]) -> PlannerConfig:

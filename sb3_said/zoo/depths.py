@@ -17,7 +17,7 @@ from sb3_said.files.archive import load_tree, readable, save_tree
 from sb3_said.files.checks import check_tensors
 from sb3_said.planner.checks import check_same
 from sb3_said.said import SAID
-from sb3_said.said.training import PLANNER_CHECKPOINT_NAME
+from sb3_said.said.training import planner_checkpoint
 from sb3_said.zoo.folder import log_suffix
 
 
@@ -145,4 +145,4 @@ class DepthPlanners:
         self.model.logger.close()
         if int(self.model.policy.planner_updates) < self.gradient_steps:
             raise KeyboardInterrupt  # what was learned is kept, but half a planner serves no comparison
-        (folder / PLANNER_CHECKPOINT_NAME).unlink(missing_ok=True)
+        planner_checkpoint(folder, self.config.mask).unlink(missing_ok=True)

@@ -354,7 +354,7 @@ class DelayedExperimentManager(ExperimentManager):
             raise
         except KeyboardInterrupt:
             self.stopping.is_asked = True
-            written = not self.stopping.is_forced and self._save_checkpoint()
+            written = not self.stopping.is_forced and self._save_checkpoint(model)
             state = "and wrote a checkpoint" if written else "without a checkpoint of this step"
             print(f"Interrupted at step {model.num_timesteps} {state}; go on with --resume {self.save_path}")
         except Exception:
@@ -376,7 +376,7 @@ class DelayedExperimentManager(ExperimentManager):
                 self.evaluation.eval_env = self.create_envs(self.n_eval_envs, eval_env=True)
             evaluate_answer(model, self.evaluation, self.folder, self.stopping)
 
-    def _save_checkpoint(self) -> bool:
+    def _save_checkpoint(self, model: Any) -> bool:
         """Write a checkpoint of a training that is asked to stop; return whether the file has it all."""
         return self.checkpointing.save()
 

@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_said.files.checkpoint import TrainingCheckpointCallback
 from sb3_said.offline import OfflineAlgorithm
 from sb3_said.said import SAID
-from sb3_said.said.training import PLANNER_CHECKPOINT_NAME
+from sb3_said.said.training import planner_checkpoint
 from sb3_said.zoo.manager import DelayedExperimentManager, Run
 
 
@@ -75,10 +75,10 @@ class OfflineExperimentManager(DelayedExperimentManager):
     def _learn(self, model: Any, steps: int, **how: Any) -> None:
         if isinstance(model, SAID):
             how |= {"folder": self.folder, "should_stop": self.stopping, "save_interval": self.run.checkpoint_freq}
-            how["log_interval"] = how["log_interval"] or steps  # one row, at the end
         model.learn_offline(None, steps, progress_bar=self.show_progress, **how)
 
-    def _save_checkpoint(self) -> bool:
+    def _save_checkpoint(self, model: Any) -> bool:
         if self.algo != "said":
-            return super()._save_checkpoint()
-        return (self.folder / PLANNER_CHECKPOINT_NAME).is_file()  # written when the planner was asked to stop
+            return super()._save_checkpoint(model)
+        mask = model.policy.planner.config.mask
+        return planner_checkpoint(self.folder, mask).is_file()  # written when the planner was asked to stop

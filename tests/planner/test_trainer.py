@@ -609,6 +609,15 @@ def test_the_planner_stays_as_it_is_until_a_training_hands_over():
     assert not th.equal(trainer.planner.normalizer.state_mean, before["normalizer.state_mean"])
 
 
+def test_no_training_goes_beyond_its_updates():
+    trainer = make_trainer()
+    total = trainer.gradient_steps
+    trainer.train(total - 1)
+    trainer.train(4)
+    assert trainer.n_updates == total
+    make_trainer().load_state_dict(trainer.state_dict())
+
+
 def test_every_training_starts_anew():
     """Old weights would read new data through another normaliser."""
     source = make_source(40, 20)

@@ -421,6 +421,24 @@ def test_a_checkpoint_of_something_else_is_refused(state, tmp_path):
 def test_unknown_intervals_are_refused_before_the_training():
     with pytest.raises(TypeError, match="no argument save_freq"):
         PlannerTrainingCallback(save_freq=5)
+    for wrong in ({"eval_interval": 0}, {"log_interval": 0.5}, {"save_interval": -1}):
+        with pytest.raises(ValueError, match=f"{next(iter(wrong))} must be a whole number, at least 1"):
+            PlannerTrainingCallback(**wrong)
+    model = make()
+    for wrong in ({"trial_episodes": -1}, {"trial_episodes": 0.5}, {"eval_interval": 0}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            model.train_planner(**wrong)
+
+
+def test_without_an_interval_there_is_one_row_at_the_end_as_with_one_of_all_updates():
+    rows = []
+    for interval in (None, 5):
+        memory = Memory()
+        model = make(planner_gradient_steps=5)
+        model.set_logger(Logger(None, [memory]))
+        model.learn(60, callback=PlannerTrainingCallback(log_interval=interval), log_interval=None)
+        rows.append([row["planner/n_updates"] for row in memory.rows if "planner/n_updates" in row])
+    assert rows == [[5], [5]]
 
 
 def test_a_file_of_a_second_training_answers_as_the_callback_saw_it(tmp_path):

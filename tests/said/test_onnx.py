@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 from gymnasium import spaces
-from small_agent import make, observe
+from small_agent import make, observe, teach
 from small_task import Drift, delayed
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -48,16 +48,14 @@ def test_it_answers_as_the_agent(max_delay, tmp_path):
 
 
 def test_it_tells_that_it_reads_normalised_observations(tmp_path):
-    model = make(VecNormalize(DummyVecEnv([delayed]), norm_obs_keys=["observation"]))
-    model.policy.make_student(16)
+    model = teach(make(VecNormalize(DummyVecEnv([delayed]), norm_obs_keys=["observation"])))
     export(model, tmp_path / "agent.onnx")
     with pytest.raises(ValueError, match=r"give normalize=venv\.normalize_obs"):
         ControlLoop(OnnxModel(tmp_path / "agent.onnx"), 1)
 
 
 def test_an_answer_that_is_not_finite_is_refused(tmp_path):
-    model = make()
-    model.policy.make_student(16)
+    model = teach(make())
     export(model, tmp_path / "agent.onnx")
     obs = observe()
     obs["observation"][3] = np.nan
@@ -66,8 +64,7 @@ def test_an_answer_that_is_not_finite_is_refused(tmp_path):
 
 
 def test_a_file_of_another_program_is_told(tmp_path):
-    model = make()
-    model.policy.make_student(16)
+    model = teach(make())
     export(model, tmp_path / "agent.onnx")
     graph = onnx.load(tmp_path / "agent.onnx")
     del graph.metadata_props[:]
@@ -81,8 +78,7 @@ def test_a_file_of_another_program_is_told(tmp_path):
 
 
 def test_a_loop_runs_it_without_pytorch(tmp_path):
-    model = make()
-    model.policy.make_student(16)
+    model = teach(make())
     export(model, tmp_path / "agent.onnx")
     code = f"""
 import sys, numpy as np
@@ -98,6 +94,7 @@ print(loop.act(0)[0], *{{"torch", "stable_baselines3"}} & sys.modules.keys())
 
 
 def test_without_a_student_there_is_nothing_to_export(tmp_path):
-    with pytest.raises(ValueError, match=r"no student to export.*model.distill\(\)"):
-        export(make(), tmp_path / "agent.onnx")
+    for model in (make(), make(student_width=16)):  # which is not taught yet
+        with pytest.raises(ValueError, match=r"no student to export.*model.distill\(\)"):
+            export(model, tmp_path / "agent.onnx")
     assert not any(tmp_path.iterdir())

@@ -323,6 +323,17 @@ def test_known_states_reach_the_planner_and_change_the_plan(trained_with_extra_s
     assert np.array_equal([not th.equal(a, b) for a, b in zip(*plans, strict=True)], has_extra)
 
 
+def test_known_states_reach_the_guess_that_the_actor_decides_on(trained_with_extra_states):
+    model, batch = trained_with_extra_states, observe(11, remembering())
+    has_extra = (batch["state_known"].astype(bool) & (np.arange(3, 0, -1) <= batch["delay"])).any(1)
+    blind = {**batch, "state_history": 0 * batch["state_history"], "state_known": 0 * batch["state_known"]}
+    seen, unseen = (model.policy._as_if_seen(model.policy.obs_to_tensor(each)[0]) for each in (batch, blind))
+    moved = ~th.isclose(seen["observation"], unseen["observation"], rtol=0, atol=0).all(1)
+    assert np.array_equal(moved, has_extra)
+    newest = batch["state_known"][:, -1].astype(bool) & (batch["delay"][:, 0] > 0)  # s_t itself
+    np.testing.assert_array_equal(seen["observation"][newest], batch["state_history"][newest, -1])
+
+
 def test_an_agent_with_extra_states_is_saved_and_repeats(trained_with_extra_states, tmp_path):
     model, batch = trained_with_extra_states, observe(11, remembering())
     model.save(tmp_path / "said")

@@ -374,7 +374,7 @@ def test_a_trained_planner_is_not_taken_over_where_its_weights_mean_something_el
         SAID.load(saved, planner_kwargs=other, device="cpu")
     model = make(planner_kwargs=other)
     before = answer(model, observe())
-    with pytest.raises(SavedFileError, match=name):
+    with pytest.raises(SavedFileError, match=f"{name}.* Make this agent with planner_kwargs={{'{name}': "):
         model.set_parameters(saved)
     assert np.array_equal(answer(model, observe()), before)
     make(seed=4).save(tmp_path / "untrained.zip")
@@ -388,6 +388,8 @@ def test_an_expert_from_a_file_without_optimizers_is_one(trained, tmp_path):
         model = make()
         model.set_parameters(tmp_path / "compact.zip")
         assert model.has_expert == has_expert
+        model.save(tmp_path / "again.zip")
+        assert SAID.load(tmp_path / "again.zip", device="cpu").has_expert == has_expert
 
 
 # ---------------------------------------------------------------------------------------------------- learning
@@ -490,6 +492,20 @@ def test_normalized_tasks(env):
     with th.no_grad():
         critic = model.policy.value(*pairs)
     np.testing.assert_allclose(values, critic * np.sqrt(vec_env.ret_rms.var + vec_env.epsilon), rtol=1e-4, atol=1e-5)
+
+
+def test_a_replay_of_normalised_states_needs_their_scale(tmp_path):
+    vec_env = VecNormalize(make_vec_env(delayed, n_envs=1, seed=0), norm_obs_keys=["observation"], norm_reward=False)
+    model = make(vec_env).learn(60)
+    model.save(tmp_path / "agent.zip")
+    loaded = SAID.load(tmp_path / "agent.zip", device="cpu")
+    loaded.replay_buffer = model.replay_buffer
+    for learn in (loaded.train_planner, loaded.distill, lambda: loaded.learn_offline(model.replay_buffer)):
+        with pytest.raises(ValueError, match=r"that VecNormalize has normalised.* load_normalization"):
+            learn()
+    loaded = SAID.load(tmp_path / "agent.zip", env=vec_env, device="cpu")
+    loaded.replay_buffer = model.replay_buffer
+    loaded.train_planner()
 
 
 def test_the_newest_part_of_the_buffer():

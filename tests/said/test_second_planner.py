@@ -4,14 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_agent import answer, make
+from small_agent import answer, make, observe
 from small_task import delayed, pendulum
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_said import SAID
+from sb3_said import SAID, PlannerTrainingCallback
+from sb3_said.files.checkpoint import TrainingCheckpointCallback, restore_training
 from sb3_said.planner import trainer as trainer_module
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.said import trial, ways
@@ -191,6 +192,31 @@ def test_a_training_stopped_amid_the_second_goes_on_there(monkeypatch, updates, 
     stopped.train_planner(folder=tmp_path, trial_episodes=3)
     assert updates == ["own"] * 3
     assert same(weights(stopped.policy.planner), weights(whole.policy.planner))
+
+
+def test_after_a_file_a_training_that_is_done_is_found_again(monkeypatch, updates, tmp_path):
+    rig(monkeypatch, "own_ages")
+    model = make_two(planner_trial_episodes=0).learn(60)
+    model.train_planner(folder=tmp_path, trial_episodes=3)
+    assert model.policy.planner.config.mask == "own"
+    model.save(tmp_path / "agent.zip")
+    model.save_replay_buffer(tmp_path / "replay.zip")
+    loaded = SAID.load(tmp_path / "agent.zip", env=model.env, device="cpu")
+    loaded.load_replay_buffer(tmp_path / "replay.zip")
+    updates.clear()
+    loaded.train_planner(folder=tmp_path, trial_episodes=3)
+    assert updates == [] and same(weights(loaded.policy.planner), weights(model.policy.planner))
+
+
+@pytest.mark.parametrize("best", WAYS)
+def test_a_checkpoint_answers_as_the_trial_chose(best, monkeypatch, tmp_path):
+    rig(monkeypatch, best)
+    agents = [make_two(planner_trial_episodes=3) for _ in range(2)]
+    agents[0].learn(60, callback=[PlannerTrainingCallback(), TrainingCheckpointCallback(tmp_path)])
+    restore_training(agents[1], tmp_path / "checkpoint.zip")
+    assert agents[1].planner_kwargs == agents[0].planner_kwargs
+    obs = observe(5, pendulum(delay=2, max_delay=2))
+    np.testing.assert_array_equal(*(answer(agent, obs) for agent in agents))
 
 
 def test_ctrl_c_amid_the_second_leaves_the_first_without_a_trial(monkeypatch, updates, capsys):

@@ -286,6 +286,15 @@ def test_who_is_not_there_cannot_answer():
         model.distill()
 
 
+def test_one_that_was_never_taught_cannot_answer_and_has_the_width_asked_for():
+    model = make(student_width=8, planner_gradient_steps=1)
+    assert model.policy.answers == ["expert"]
+    with pytest.raises(ValueError, match=r"no student yet; call distill\(\)"):
+        model.set_answer("student")
+    model.learn(30).distill(**{**QUICK, "width": None, "gradient_steps": 2})
+    assert model.policy.student.width == model.student_width == 8 and "student" in model.policy.answers
+
+
 def test_it_is_small_and_reads_no_state_history():
     env = delayed()
     student = Student(env.observation_space, env.action_space, 256)

@@ -138,6 +138,14 @@ def test_episodes_of_several_environments_are_the_same_ones_whoever_ends_first()
     assert set(found.ages) <= {0, 1, 2} and len(set(found.ages)) > 1
 
 
+def test_each_of_the_environments_plays_though_their_delays_differ():
+    env = DummyVecEnv([lambda delay=delay: Monitor(pendulum(9, delay, 2)) for delay in range(3)])
+    model = make(env=env, planner_ways=OF_ONE_PLANNER).learn(60)
+    found = trial.play_trial(model, n_episodes=5)
+    np.testing.assert_array_equal(found.ages, [0, 1, 2, 0, 1])
+    assert sorted({len(returns) for returns in found.returns.values()}) == [3, 5]  # a quarter is less than one round
+
+
 def test_ages_that_change_within_an_episode_tell_nothing_of_it():
     """The planner and the expert then meet other ages in what is the same episode by name."""
     model = make(env=pendulum(delay=UniformDelay(0, 2))).learn(60)

@@ -25,6 +25,8 @@ def test_ways_that_are_given_are_checked_and_settings_of_the_users_own_are_kept(
     own = {"own": {"sampling_steps": 3}}
     assert SAID.load(tmp_path / "said", planner_kwargs={"temperature": 0.5}, planner_ways=own).planner_ways == own
     assert make(planner_ways={}).planner_ways == {}
+    two = make(planner_ways={**own, "second": {"mask": "own", "present": "inpainted"}}).planner_ways
+    assert two["own"] == {"mask": "random", "present": "guessed", "sampling_steps": 3}  # also once the second is taken
     for wrong in ({"x": {"depth": 4}}, {"expert": {"temperature": 0.1}}, {"x": {"temperature": -1.0}}):
         with pytest.raises(ValueError, match=r"depth|expert|temperature"):
             make(planner_ways=wrong)
@@ -55,6 +57,7 @@ def test_a_decision_of_one_s_own_is_kept_in_a_file_and_tried_against_all_ways(se
     model.set_planner(**settings)
     model.save(tmp_path / "agent.zip")
     loaded = SAID.load(tmp_path / "agent.zip", env=pendulum(delay=(0, 2)), device="cpu")
-    assert loaded.policy.planner.config == model.policy.planner.config and loaded.planner_ways == ways
+    assert loaded.policy.planner.config == model.policy.planner.config
+    assert loaded.planner_ways == {name: {"mask": "random", "present": "guessed", **way} for name, way in ways.items()}
     model.train_planner(trial_episodes=1)
     assert set(trial.play_trial(model, 1).returns) >= {"planner", "expert"}

@@ -1,9 +1,11 @@
 """Agents that learn a small task in a moment, and what to ask them."""
 
 import numpy as np
+import torch as th
 from small_task import delayed
 
 from sb3_said import SAID
+from sb3_said.said.student import Student
 
 PLANNER = {
     "d_model": 32,
@@ -28,6 +30,14 @@ def make(env=None, cls=SAID, policy="MlpPolicy", planner_kwargs=(), **kwargs):
             "planner_trial_episodes": 0,
         }
     return cls(policy, delayed() if env is None else env, **(arguments | kwargs))
+
+
+def teach(model, width=16):
+    """Give a model a student that is scaled as by :meth:`distill`, and has learned nothing else."""
+    student = Student(model.observation_space, model.action_space, width)
+    student.scale_to(th.randn(9, len(student.mean), generator=th.Generator().manual_seed(0)))
+    model.policy.student, model.student_width = student.to(model.device), width
+    return model
 
 
 def observe(n=7, env=None):

@@ -6,17 +6,14 @@ import pytest
 
 pytest.importorskip("rl_zoo3")
 
-from small_agent import make
+from small_agent import make, teach
 
 from sb3_said.zoo import export
 
 
 def test_the_command_writes_the_student(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     onnx = pytest.importorskip("onnx")
-    model = make()
-    model.policy.make_student(8)
-    model.student_width = 8
-    model.save(tmp_path / "agent.zip")
+    teach(make(), 8).save(tmp_path / "agent.zip")
     export.main([str(tmp_path / "agent.zip"), str(tmp_path / "agent.onnx")])
     assert [node.name for node in onnx.load(tmp_path / "agent.onnx").graph.output] == ["action"]
     assert capsys.readouterr().out == f"Wrote {tmp_path / 'agent.onnx'}\n"
