@@ -191,7 +191,7 @@ def test_an_expert_that_has_learned_nothing_is_not_let_answer():
 @pytest.mark.parametrize("is_loaded", [False, True])
 def test_steps_that_follow_updates_are_counted_from_the_first(is_loaded, tmp_path):
     """Else states would be scaled by the first one, and no step be taken at random."""
-    model = learn(steps=40)
+    model = learn(steps=10)
     if is_loaded:
         model.save(tmp_path / "agent.zip")
         model = SAID.load(tmp_path / "agent.zip", env=delayed(), device="cpu")
@@ -201,7 +201,7 @@ def test_steps_that_follow_updates_are_counted_from_the_first(is_loaded, tmp_pat
     assert model.num_timesteps == 30 and model._n_updates == 30 - 20  # learning_starts
     normalizer = model.policy.state_normalizer
     assert normalizer.fitted_at > 20 and (normalizer.deviation > 0.1).all()
-    learn(model, steps=40)  # once more, by one that has an expert now
+    learn(model, steps=10)  # once more, by one that has an expert now
     with pytest.warns(UserWarning, match="no longer holds the dataset"):
         model.learn(25, reset_num_timesteps=False)
     assert model.num_timesteps == 25 and model._n_updates == 10 + 5
