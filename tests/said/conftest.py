@@ -5,13 +5,8 @@ from small_agent import make
 
 
 @pytest.fixture(scope="module", autouse=True)
-def small_first_guesses():
-    """A planner's first guess is as small as the planners here, and takes half of the time."""
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("sb3_said.planner.plain.MODEL_WIDTH", 32)
-        patched.setattr("sb3_said.planner.plain.MODEL_BLOCKS", 1)
-        patched.setattr("sb3_said.planner.first_guess.CLONE_WIDTH", 32)
-        yield
+def of_small_agents(small_first_guesses):
+    """In all tests of this folder."""
 
 
 @pytest.fixture(scope="module")
