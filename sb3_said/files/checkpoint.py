@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import random
 import time
 import warnings
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -178,10 +179,13 @@ def training_state(
 
 def checksum(model: OffPolicyAlgorithm) -> int:
     """Return a number that tells replays apart, of all that they teach."""
-    replay, found = _replay_buffer(model), 0
-    for name in ("observations", "actions", "rewards", "dones", "timeouts"):
-        found = zlib.crc32(np.ascontiguousarray(getattr(replay, name)[: replay.size()]).data, found)
-    return found
+    replay, names = _replay_buffer(model), ("observations", "actions", "rewards", "dones", "timeouts")
+    return crc32(getattr(replay, name)[: replay.size()] for name in names)
+
+
+def crc32(arrays: Iterable[np.ndarray]) -> int:
+    """Return the CRC-32 of arrays, one behind the other."""
+    return functools.reduce(lambda found, array: zlib.crc32(np.ascontiguousarray(array).data, found), arrays, 0)
 
 
 def evaluations_of(callback: BaseCallback | None) -> list[dict[str, Any]]:

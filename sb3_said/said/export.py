@@ -34,11 +34,12 @@ def to_onnx(model: SAID) -> Any:
     except ImportError as error:
         raise ImportError('onnx is missing, which export needs: pip install "sb3_said[export]"') from error
     policy, student = model.policy, model.policy.student
-    if student is None or not student.has_learned:
+    if "student" not in policy.answers:
         raise ValueError(
             "This agent has no student to export. In Python: model = SAID.load(file, env=env); model.distill(); "
             "model.save(file)."
         )
+    assert student is not None  # who answers is there
     state_space, space, max_delay = check_spaces(policy.observation_space, policy.action_space)
     obs_dim, act_dim = state_space.shape[0], space.shape[0]
     nodes: list[Any] = []

@@ -237,7 +237,7 @@ class SAIDPolicy(DelayedSACPolicy):
             )
         if who in ("planner", "both") and not self.planner_is_trained:
             raise ValueError("The planner is not trained yet; call learn() or train_planner() first.")
-        if who == "student" and (self.student is None or not self.student.has_learned):
+        if who == "student" and "student" not in self.answers:
             raise ValueError("There is no student yet; call distill() first.")
 
     def value(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
@@ -304,17 +304,16 @@ class SAIDPolicy(DelayedSACPolicy):
             is_delayed = isinstance(self.observation_space, spaces.Dict)
             seen = self._as_if_seen(observation) if is_delayed else observation["observation"]
             return super()._predict(seen, deterministic=True)
-        state, history, delay = (observation[key] for key in KEYS)
-        return self.planner.plan(state, history, delay[:, 0].long(), temperature=0.0).action
+        known, extra = _known(observation)
+        return self.planner.plan(*known, **extra, temperature=0.0).action
 
     def _as_if_seen(self, observation: PyTorchObs) -> PyTorchObs:
         """Return observations of age 0, of the present that the planner's first guess has for each row."""
         if not isinstance(observation, dict):
             return observation
-        state, history, delay = (observation[key] for key in KEYS)
-        extra = {key: observation[key] for key in STATE_KEYS if key in observation}
-        present, _ = self.planner.guess(state, history, delay[:, 0].long(), **extra)
-        return {**observation, "observation": present, "delay": th.zeros_like(delay)}
+        known, extra = _known(observation)
+        present, _ = self.planner.guess(*known, **extra)
+        return {**observation, "observation": present, "delay": th.zeros_like(observation["delay"])}
 
     def _is_experts(self, observation: PyTorchObs, who: Answer) -> th.Tensor:
         """Tell for which observations the expert decides: (B,) bool.
@@ -364,14 +363,10 @@ class SAIDPolicy(DelayedSACPolicy):
 
         :param repeats: let each row decide its noise
         """
-        parts = as_delayed(observation, self.planner.act_dim)
-        extra: dict[str, Any] = {key: parts[key] for key in STATE_KEYS if key in parts}
-        states, history, delay = (parts[key] for key in KEYS)
+        known, extra = _known(as_delayed(observation, self.planner.act_dim))
         chooses = self.planner.config.temperature > 0  # else there is no noise and one candidate
         return self.planner.plan(
-            states,
-            history,
-            delay[:, 0].long(),
+            *known,
             value_fn=self.value if chooses else None,
             noise=th.stack([*map(self._noise_of, rows_of(observation))]) if chooses and repeats else None,
             **extra,
@@ -428,3 +423,12 @@ class SAIDPolicy(DelayedSACPolicy):
             "iql_kwargs": asdict(self.iql_config),
             "student_width": None if self.student is None else self.student.width,
         }
+
+
+def _known(parts: dict[str, th.Tensor]) -> tuple[tuple[th.Tensor, th.Tensor, th.Tensor], dict[str, Any]]:
+    """Return what :class:`~sb3_said.planner.InpaintingPlanner` is told of delayed observations (B, ...).
+
+    :return: state, action history and age; and the states of a state history by name, where there is one
+    """
+    state, history, delay = (parts[key] for key in KEYS)
+    return (state, history, delay[:, 0].long()), {key: parts[key] for key in STATE_KEYS if key in parts}

@@ -218,7 +218,7 @@ def open_agents(args: argparse.Namespace) -> Iterator[Share]:
         make_env = next(iter(runs.values())).make_env if runs else lambda: gym.make(args.env)
         info = {"env": args.env or next(iter(tasks)), "algo": "random"}
         changes = next(iter(settings.values()), {})
-        runs["random"] = LoadedRun(None, make_env, None, Path(), info, changes)  # type: ignore[arg-type]
+        runs["random"] = LoadedRun(None, make_env, None, Path(), info, changes)  # type: ignore[arg-type]  # no model
     for run in runs.values():
         env = run.make_env()
         check_spaces(env.observation_space, env.action_space)

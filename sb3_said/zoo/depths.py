@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import zlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +12,7 @@ from filelock import FileLock, Timeout
 from stable_baselines3.common.logger import Logger, make_output_format
 
 from sb3_said.files.archive import load_tree, readable, save_tree
+from sb3_said.files.checkpoint import crc32
 from sb3_said.files.checks import check_tensors
 from sb3_said.planner.checks import check_same
 from sb3_said.said import SAID
@@ -50,8 +49,7 @@ class DepthPlanners:
         self.config = replace(model.policy.planner.config, decided_by="plan")  # else the tries would all be alike
         serves = int(model.policy.planner_updates) == self.gradient_steps
         self._own = model.policy.planner if serves else None
-        weights = (weight.detach().cpu().numpy().data for weight in model.policy.parameters())
-        self._agent = f"{functools.reduce(lambda found, weight: zlib.crc32(weight, found), weights, 0):08x}"
+        self._agent = f"{crc32(weight.numpy(force=True) for weight in model.policy.parameters()):08x}"
 
     def path(self, depth: int) -> Path:
         """Where the planner of a depth is kept."""
