@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import DegenerateDataWarning, bootstrap
-from scipy.stats import t as t_distribution
+from scipy.special import stdtrit
 
 # With fewer units a bootstrap interval covers less than Student's t, of normal and of skewed values alike.
 FEWEST_RESAMPLED = 10
@@ -169,8 +168,10 @@ def confidence_interval(
     if n < FEWEST_RESAMPLED:
         without_one = of_units(np.stack([np.delete(everyone, i) for i in everyone]))  # (n,)
         error = math.sqrt((n - 1) * np.var(without_one))
-        half = float(t_distribution.ppf((1 + confidence) / 2, n - 1)) * error
+        half = float(stdtrit(n - 1, (1 + confidence) / 2)) * error
         return Interval(value, value - half, value + half, confidence, n, "Student's t")
+    from scipy.stats import DegenerateDataWarning, bootstrap  # a second, which a command's --help can do without
+
     method = "BCa bootstrap"
     settings = {"statistic": of_units, "confidence_level": confidence, "vectorized": True}
     with warnings.catch_warnings(), np.errstate(divide="ignore", invalid="ignore"):

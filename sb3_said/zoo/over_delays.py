@@ -307,7 +307,11 @@ def play_all(cells: list[Cell], env_id: str, args: argparse.Namespace) -> Iterat
     if args.workers == 1:
         yield from ((cell, play(cell, *how)) for cell in cells)
         return
-    context = multiprocessing.get_context("spawn")  # forked processes would share torch's threads
+    # As SB3's environments in processes: plain forks would share torch's threads
+    can_fork = "forkserver" in multiprocessing.get_all_start_methods()
+    context = multiprocessing.get_context("forkserver" if can_fork else "spawn")
+    if can_fork:
+        context.set_forkserver_preload([__name__])  # so that workers import it once
     pool = ProcessPoolExecutor(args.workers, context, initializer=begin_worker, initargs=(args.num_threads,))
     try:
         futures = {pool.submit(play, cell, *how): cell for cell in cells}

@@ -13,8 +13,3 @@ def trained():
 def saved(trained, tmp_path):
     trained.save(tmp_path / "agent")
     return tmp_path / "agent.zip"
-
-
-@pytest.fixture(scope="module", autouse=True)
-def of_small_agents(small_first_guesses):
-    """In all tests of this folder."""

@@ -1,27 +1,21 @@
 """A tenth of the hostile files; how to load all of them is said in ``tests/support/hostile_run.py``."""
 
 import json
-import os
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from forked import begin, run_script
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits its memory as Linux does")
-def test_hostile_files_are_refused_or_harmless():
-    support = Path(__file__).parents[1] / "support"
-    paths = os.pathsep.join([str(support), str(support.parents[1]), os.environ.get("PYTHONPATH", "")])
-    done = subprocess.run(
-        [sys.executable, str(support / "hostile_run.py"), "10"],
-        env={**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    found = json.loads(done.stdout[done.stdout.index("{") :])
+def test_hostile_files_are_refused_or_harmless(tmp_path):
+    run = Path(__file__).parents[1] / "support" / "hostile_run.py"
+    process = begin(tmp_path / "output.txt", run_script, run, ["10"])
+    process.join()
+    shown = (tmp_path / "output.txt").read_text()
+    assert process.exitcode == 0, shown[-2000:]
+    found = json.loads(shown[shown.index("{") :])
     assert found["failures"] == []
     outcomes = found["outcomes"]
     assert sum(outcomes.values()) == 200

@@ -21,7 +21,7 @@ from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.replay.windows import WindowSource
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("small_first_guesses")]
+pytestmark = pytest.mark.slow
 D = 3
 GRADIENT_STEPS = 400
 

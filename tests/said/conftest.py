@@ -4,11 +4,6 @@ import pytest
 from small_agent import make
 
 
-@pytest.fixture(scope="module", autouse=True)
-def of_small_agents(small_first_guesses):
-    """In all tests of this folder."""
-
-
 @pytest.fixture(scope="module")
 def trained():
     """A trained agent; tests must leave it as it is."""

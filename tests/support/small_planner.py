@@ -1,7 +1,10 @@
 """A small planner whose weights are random, and what to ask it."""
 
 import dataclasses
+from collections.abc import Iterator
+from contextlib import contextmanager
 
+import pytest
 import torch as th
 
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
@@ -20,6 +23,16 @@ SMALL = PlannerConfig(
     present="inpainted",
 )
 LENGTH = DELAY + SMALL.horizon
+
+
+@contextmanager
+def with_small_first_guesses() -> Iterator[None]:
+    """A planner's first guess is as small as the planners of the tests, and takes half of the time."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("sb3_said.planner.plain.MODEL_WIDTH", 32)
+        patched.setattr("sb3_said.planner.plain.MODEL_BLOCKS", 1)
+        patched.setattr("sb3_said.planner.first_guess.CLONE_WIDTH", 32)
+        yield
 
 
 def make_planner(max_delay=DELAY, **changes):

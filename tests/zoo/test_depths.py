@@ -17,7 +17,6 @@ from sb3_said import SAID, PlannerConfig
 from sb3_said.files.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback
 from sb3_said.zoo.depths import DepthPlanners
 
-pytestmark = pytest.mark.usefixtures("small_first_guesses")
 STEPS = 3
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -16,6 +14,7 @@ import pytest
 
 pytest.importorskip("rl_zoo3")
 
+from forked import begin, run_script
 from trained_run import ENV, NETWORKS, PLANNER
 
 from sb3_said import SAID
@@ -163,22 +162,21 @@ def test_ctrl_c_reaches_a_training_whose_environments_are_processes(tmp_path: Pa
     """A terminal sends it to all processes; those of the environments must outlive it."""
     words = arguments(tmp_path, "--vec-env", "subproc")
     words[words.index("-n") + 1] = "1000000"
-    process = subprocess.Popen(
-        [sys.executable, str(SCRIPT), *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        start_new_session=True, env={**os.environ, "PYTHONPATH": str(SCRIPT.parents[1])},
-    )  # fmt: skip
+    process = begin(output := tmp_path / "output.txt", run_script, SCRIPT, words)
+    assert process.pid is not None
     try:
-        while process.poll() is None:  # up to the test's own time: a start takes minutes where others have the cores
+        while process.is_alive():  # up to the test's own time: a start takes minutes where others have the cores
             logs = tmp_path.glob("said/*/*.monitor.csv")
             if any(len(log.read_text().splitlines()) > 2 for log in logs):  # an episode below the header: it learns
                 break
             time.sleep(0.1)
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGINT)
-        shown = process.communicate(timeout=120)[0]
+        process.join(timeout=120)
     finally:
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
-    assert process.returncode == 130 and "and wrote a checkpoint" in shown, shown
+    shown = output.read_text()
+    assert process.exitcode == 130 and "and wrote a checkpoint" in shown, shown
     steps = load_tree(run_of(tmp_path) / "checkpoint.zip")["counters"]["num_timesteps"]
     assert steps > 0 and f"Interrupted at step {steps}" in shown

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import errno
+import functools
 import json
+import os
 import shutil
 import signal
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import yaml
 pytest.importorskip("rl_zoo3")
 
 import gymnasium as gym
+from forked import begin, run_script
 from kill import Killed
 from stable_baselines3.common.callbacks import EvalCallback
 from trained_run import NETWORKS, train_here
@@ -26,6 +27,7 @@ from sb3_said import SAID, DelayedSAC
 from sb3_said.delays.space import ages_of
 from sb3_said.files.archive import load_tree
 from sb3_said.files.checkpoint import TrainingCheckpointCallback
+from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.zoo import manager, train
 from sb3_said.zoo.arguments import Delay
 from sb3_said.zoo.folder import log_suffix
@@ -121,28 +123,25 @@ def test_a_killed_run_goes_on_from_its_checkpoint_twice_alike(
     assert np.load(folder / "expert" / "evaluations.npz")["timesteps"].tolist() == [100, 200]
 
 
-# scripts/train.py with checkpoints of the planner every 5 updates, not 1,000, that kills itself at the 8th.
-KILLED_AMID_UPDATES = """
-import functools, os, runpy, signal
+def train_killed_amid_updates(folder: Path) -> None:
+    """Train with checkpoints of the planner every 5 updates, not 1,000, and a kill -9 at the 8th."""
 
-from sb3_said.planner.trainer import PlannerTrainer
-from sb3_said.zoo import manager
+    def step(trainer: PlannerTrainer, original: Any = PlannerTrainer.step) -> None:
+        if trainer.n_updates == 8:
+            os.kill(os.getpid(), signal.SIGKILL)
+        original(trainer)
 
-def step(trainer, original=PlannerTrainer.step):
-    if trainer.n_updates == 8:
-        os.kill(os.getpid(), signal.SIGKILL)
-    original(trainer)
-
-PlannerTrainer.step = step
-manager.PlannerTrainingCallback = functools.partial(manager.PlannerTrainingCallback, save_interval=5)
-runpy.run_path(SCRIPT, run_name="__main__")
-"""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(PlannerTrainer, "step", step)
+        often = functools.partial(manager.PlannerTrainingCallback, save_interval=5)
+        patched.setattr(manager, "PlannerTrainingCallback", often)
+        run_script(SCRIPTS / "train.py", arguments(folder))
 
 
 def test_a_run_killed_amid_the_planners_updates_ends_as_if_it_was_not(finished: Path, tmp_path: Path) -> None:
-    code = f"SCRIPT = {str(SCRIPTS / 'train.py')!r}{KILLED_AMID_UPDATES}"
-    killed = subprocess.run([sys.executable, "-c", code, *arguments(tmp_path)], capture_output=True, timeout=240)
-    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    killed = begin(output := tmp_path / "output.txt", train_killed_amid_updates, tmp_path)
+    killed.join(timeout=240)
+    assert killed.exitcode == -signal.SIGKILL, output.read_text()
     folder = run_of(tmp_path)
     assert load_tree(folder / "planner_checkpoint.zip")["trainer"]["n_updates"] == 5
     train.main(["--resume", str(folder)])

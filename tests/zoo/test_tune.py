@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -17,6 +14,7 @@ import torch as th
 pytest.importorskip("rl_zoo3")
 pytest.importorskip("scipy")
 
+from forked import begin, run_script
 from rl_zoo3 import exp_manager
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from trained_run import ENV, config_of, read_by_train, train_run, train_said
@@ -178,15 +176,13 @@ def test_a_search_for_how_the_critics_choose(run: Path) -> None:
 
 def test_two_workers_share_a_study_and_train_no_depth_twice(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = [str(run), "--depths", "2", "3", "--temperatures", "0", "1", *QUICK]
-    other = subprocess.Popen(
-        [sys.executable, str(SCRIPT), *command], env={**os.environ, "OMP_NUM_THREADS": "1"}, stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT, text=True,
-    )  # fmt: skip
-    while other.poll() is None and not (run / "tune" / "study.lock").exists():  # it has all its imports then
+    other = begin(output := run / "output.txt", run_script, SCRIPT, command)
+    while other.is_alive() and not (run / "tune" / "study.lock").exists():  # it has all its imports then
         time.sleep(0.02)
     tune.main(command)  # this process is the second worker
-    outputs = [other.communicate(timeout=240)[0], capsys.readouterr().out]
-    assert other.returncode == 0, outputs
+    other.join(timeout=240)
+    outputs = [output.read_text(), capsys.readouterr().out]
+    assert other.exitcode == 0, outputs
     assert sum(out.count("Training the planner of depth 2") for out in outputs) == 1, outputs
     assert sum(out.count("Training the planner of depth 3") for out in outputs) == 1, outputs
     trials = results_of(run)["trials"]
