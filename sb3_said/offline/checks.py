@@ -17,13 +17,16 @@ ACTION_TOLERANCE = 1e-3  # of half the range: what float32 and a tanh leave beyo
 Columns = dict[str, np.ndarray]
 
 
-def check_task(name: str, given: str | None, env_id: str | None) -> None:
-    """Refuse data of another task, and warn of another version of it.
+def check_task(name: str, given: str | None, changes: str, env_id: str | None) -> None:
+    """Refuse data of another task, and warn of another version of it, or of one that was changed.
 
     :param given: id of the task that the data is of, None where it does not say
+    :param changes: how that task was changed, empty where it was not
     :param env_id: id of the task to learn, None where it has none
     :raises ValueError: naming both
     """
+    if changes:
+        warnings.warn(f"{name} is of a task changed by {changes}: learn for one that is changed alike.", stacklevel=3)
     if given is None or env_id is None or given == env_id:
         return
     message = f"{name} is of {given}, and the task is {env_id}"

@@ -133,7 +133,7 @@ def load_dataset(
         joined
     :param observation_space: of the task, with or without ``DelayedObservationWrapper``
     :param action_space: of the task
-    :param env_id: refuse a dataset that says it is of another task
+    :param env_id: refuse a dataset that says it is of another task; one of another version, or of a changed task, warns
     :param progress_bar: show one, where reading takes long
     :raises ValueError: for what is no dataset, a damaged file, data of other shapes or another task, actions outside
         the bounds, entries that are NaN or infinite, flags other than 0 and 1, and steps that do not follow each other.
@@ -144,7 +144,7 @@ def load_dataset(
     read = []
     for part in source if isinstance(source, (list, tuple)) else [source]:
         log = _read(part, progress_bar)
-        check_task(log.name, log.task, env_id)
+        check_task(log.name, log.task, log.changes, env_id)
         known = [(name, columns) for name, columns in log.parts if len(columns["rewards"])]
         if not known:
             raise ValueError(f"{log.name} has no step whose next state is known.")
@@ -163,7 +163,7 @@ def is_file(source: Any) -> bool:
 def _read(source: Any, progress_bar: bool) -> Log:
     if isinstance(source, Dataset):
         name = type(source).__name__
-        return Log(name, None, [(name, _of_dataset(name, source))], is_scaled=True)
+        return Log(name, None, "", [(name, _of_dataset(name, source))], is_scaled=True)
     if isinstance(source, ReplayBuffer):
         return read_buffer(source)
     if is_file(source):

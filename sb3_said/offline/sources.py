@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 import warnings
@@ -26,8 +27,9 @@ COLUMNS = {
     "next_observations": ("next_observations", "next_states", "next_obs"),
 }
 TASK = "env"  # entry of an .npz, entry or attribute of an HDF5 file: id of the task, where it says
+ABOUT = "about"  # entry of an .npz: what collect tells of it, in JSON
 MINARI = 'pip install "sb3_said[offline]"' if sys.version_info >= (3, 11) else "it needs Python 3.11, an .npz does not"
-READ = {TASK, *(name for names in COLUMNS.values() for name in names)}
+READ = {TASK, ABOUT, *(name for names in COLUMNS.values() for name in names)}
 
 
 class Log(NamedTuple):
@@ -36,6 +38,8 @@ class Log(NamedTuple):
     name: str
     task: str | None
     """id of the task that it is of, where it says"""
+    changes: str
+    """how that task was changed, in JSON; empty where it was not, or where nothing says so"""
     parts: list[tuple[str, Columns]]
     """each with its name, for errors"""
     is_scaled: bool = False
@@ -71,10 +75,20 @@ def read_file(path: Path, progress_bar: bool) -> Log:
                 given |= {TASK: file.attrs[TASK]} if TASK in file.attrs else {}
     except Exception as error:  # NumPy, zipfile and HDF5 raise many kinds
         raise ValueError(f"{path} cannot be read; it is damaged, or no {path.suffix} file: {error}") from error
-    task = given.pop(TASK, None)
+    task, about = given.pop(TASK, None), given.pop(ABOUT, "")
     task = task.decode(errors="replace") if isinstance(task, bytes) else task
     name = os.fspath(path)
-    return Log(name, task if isinstance(task, str) else None, [(name, _of_columns(name, given))])
+    parts = [(name, _of_columns(name, given))]
+    return Log(name, task if isinstance(task, str) else None, _changes(about), parts)
+
+
+def _changes(about: Any) -> str:
+    """Return what collect tells of changes to a task; other descriptions tell nothing of them."""
+    try:
+        found = json.loads(str(about))["changes"]
+    except (ValueError, TypeError, KeyError):
+        return ""
+    return json.dumps(found) if found else ""
 
 
 def _of_columns(name: str, given: Mapping[str, Any]) -> Columns:
@@ -154,7 +168,7 @@ def read_buffer(buffer: ReplayBuffer) -> Log:
             "next_observations": next_states,
         }
         parts.append((f"environment {env} of {name}", columns))
-    return Log(name, None, parts, is_scaled=True)
+    return Log(name, None, "", parts, is_scaled=True)
 
 
 def read_minari(source: Any, progress_bar: bool) -> Log:
@@ -183,7 +197,8 @@ def read_minari(source: Any, progress_bar: bool) -> Log:
         raise ValueError(
             f"The dataset {name} in {source.spec.data_path} cannot be read; it is damaged: {error}"
         ) from error
-    return Log(name, None if spec is None else spec.id, parts)
+    told = source.storage.metadata.get("description", "")
+    return Log(name, None if spec is None else spec.id, _changes(told), parts)
 
 
 def _of_episode(name: str, episode: Any) -> tuple[str, Columns]:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
+import warnings
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +43,7 @@ def load(path: Path | str) -> Dataset:
     return load_dataset(path, *spaces_of(ENV), ENV)
 
 
-def collected(path: Path, *words: str | Path) -> Dataset:
+def collected(path: Path | str, *words: str | Path) -> Dataset:
     collect.main([*map(str, words), "-o", str(path), "--device", "cpu", "--n-envs", "3"])
     return load(path)
 
@@ -194,16 +196,23 @@ def own_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     sys.modules.pop("own_package", None)
 
 
-def test_a_changed_task_is_said(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_changed_task_is_said(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     changed = train_run(tmp_path, "sadr", options=["--env-kwargs", "reset_noise_scale:0.2"])
-    collected(tmp_path / "a.npz", changed, "random", "--steps", "20")
+    for target in (tmp_path / "a.npz", *(["mine/changed-v0"] if find_spec("minari") else [])):
+        with pytest.warns(UserWarning, match=rf'{target} is of a task changed by {{"env_kwargs": .*: learn for one'):
+            collected(target, changed, "random", "--steps", "20")
     about = json.loads(str(np.load(tmp_path / "a.npz")["about"]))
     assert about["changes"] == {"env_kwargs": {"reset_noise_scale": 0.2}}
     assert f'of {ENV} changed by {{"env_kwargs": {{"reset_noise_scale": 0.2}}}}' in capsys.readouterr().out
     with pytest.raises(SystemExit):
         collected(tmp_path / "b.npz", changed, run, "--steps", "20")
     assert "the agents change theirs differently" in capsys.readouterr().err
-    collected(tmp_path / "c.npz", run, "--steps", "20")
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", ".*changed")
+        collected(tmp_path / "c.npz", run, "--steps", "20")
     assert "changed by" not in capsys.readouterr().out
 
 
