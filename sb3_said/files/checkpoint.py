@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EventCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_said.files.agents import SafeSaveMixin, agent_state, restore_agent
@@ -328,4 +328,6 @@ def _replay_buffer(model: OffPolicyAlgorithm) -> Any:
 def _eval_callbacks(callback: BaseCallback | None) -> list[EvalCallback]:
     if isinstance(callback, CallbackList):  # nested: SB3's progress bar puts the run's list into another
         return [found for child in callback.callbacks for found in _eval_callbacks(child)]
-    return [callback] if isinstance(callback, EvalCallback) else []
+    if isinstance(callback, EvalCallback):
+        return [callback]
+    return _eval_callbacks(callback.callback) if isinstance(callback, EventCallback) else []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -36,8 +37,10 @@ def load_normalization(path: Path, venv: VecEnv, training: bool = False) -> VecN
     saved = load_tree(path, KIND)
     with readable(path, explained=(ValueError, AssertionError)):  # SB3 asserts what it needs
         settings = {name: saved["settings"][name] for name in _SETTINGS}
-        check_numbers("settings", settings)
-        for name, value in settings.items():
+        no_clip = {name for name in ("clip_obs", "clip_reward") if settings[name] == math.inf}
+        finite = {name: value for name, value in settings.items() if name not in no_clip}
+        check_numbers("settings", finite)
+        for name, value in finite.items():
             check_argument(name, value, VecNormalize)
         if min(settings[name] for name in ("epsilon", "clip_obs", "clip_reward")) <= 0:
             raise ValueError(f"its epsilon and clips are to be above 0: {settings}")

@@ -88,6 +88,7 @@ class ControlLoop:
                 "normalize=lambda obs: obs where they are so already."
             )
         self._asking = Asking(model, max_delay, deterministic, normalize)
+        period, action_delay = float(period), float(action_delay)  # a float32 would round the times of a clock
         if not (period > 0 and action_delay >= 0):
             raise ValueError(f"period is {period} and action_delay {action_delay}, expected above 0 and at least 0.")
         counts = {"answer_steps": answer_steps, "max_age": max_age, "hold_steps": hold_steps, "safe_steps": safe_steps}

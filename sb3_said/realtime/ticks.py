@@ -23,7 +23,7 @@ def ticks(
     """
     if not period > 0:
         raise ValueError(f"period is {period}, expected seconds above 0.")
-    due = clock()
+    period, due = float(period), clock()
     while True:
         yield clock()
         due += period

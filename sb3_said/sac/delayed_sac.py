@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, ClassVar
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3 import SAC
@@ -201,7 +202,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
         None without Monitors, and where an episode has no step yet: they do not tell one reset from another.
         """
         assert self.env is not None
-        if not all(self.env.env_is_wrapped(Monitor)):
+        if not all(_are_wrapped(self.env, Monitor)):
             return None
         in_episode = [len(rewards) for rewards in self.env.get_attr("rewards")]
         return [*zip(self.env.get_attr("total_steps"), in_episode, strict=True)] if all(in_episode) else None
@@ -377,5 +378,13 @@ class DelayedSAC(SafeSaveMixin, SAC):
 def _is_delayed(env: Any) -> bool:
     """Tell whether a ``DelayedObservationWrapper`` is somewhere in an environment, or in one of a ``VecEnv``."""
     if isinstance(env, VecEnv):
-        return any(env.env_is_wrapped(DelayedObservationWrapper))
+        return any(_are_wrapped(env, DelayedObservationWrapper))
     return is_wrapped(env, DelayedObservationWrapper)
+
+
+def _are_wrapped(env: VecEnv, wrapper: type[gym.Wrapper[Any, Any, Any, Any]]) -> list[bool]:
+    """Tell which environments have a wrapper: none of a simulator that is no Gymnasium and cannot be asked."""
+    try:
+        return env.env_is_wrapped(wrapper)
+    except (NotImplementedError, AttributeError):
+        return [False] * env.num_envs

@@ -8,6 +8,7 @@ from sb3_said.sac.scaling import OnTheHost
 
 N_EPISODES = 10  # whose mean is looked at
 LOST = 0.5  # of what was learned: by hindsight on two runs, results/stable_expert.md
+NOISE = 1.2  # standard deviations of the ten that a fall is above; where six of ten fall it is
 FORGETS = 100_000  # environment steps in which the best is forgotten, where no episode returns as much any more
 
 
@@ -48,9 +49,14 @@ class TrainingEpisodes(OnTheHost):
 
     @property
     def have_collapsed(self) -> bool:
-        """Whether the last ten episodes return less than half of what was learned since the first ten."""
-        learned = float(self.best - self.first)
-        return bool(self.count > N_EPISODES) and float(self.newest.mean() - self.first) < (1.0 - LOST) * learned
+        """Whether the last ten episodes have lost half of what was learned since the first ten, and more than noise.
+
+        What was learned since is no more than noise where an agent had learned before, and less than nothing where a
+        task returns less than it did.
+        """
+        fall, learned = self.best - self.newest.mean(), self.best - self.first
+        noise = self.newest.std(correction=0)
+        return bool(self.count > N_EPISODES) and bool(fall > th.maximum(LOST * learned.abs(), NOISE * noise))
 
     def forget(self) -> None:
         """Begin anew, as another training does."""

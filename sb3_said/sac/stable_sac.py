@@ -16,6 +16,7 @@ from sb3_said.sac.policies import DelayedSACPolicy
 
 REFIT_GROWTH = 1.1  # the states are looked at again when there are a tenth more of them
 STATES_LOOKED_AT = 10_000
+YOUTH = 4.0  # decays of a young average are 1 - YOUTH / n, so that it is n / 5 updates old: results/stable_expert.md
 
 
 class StableSAC(DelayedSAC):
@@ -165,13 +166,16 @@ class StableSAC(DelayedSAC):
             normalizer.fit(seen[UNDELAYED] if isinstance(seen, dict) else seen, self.num_timesteps)
 
     def _average_actor(self, waits: bool = False) -> None:
-        """Move the average towards the actor; of the first updates it is the plain mean.
+        """Move the average towards the actor; while it is young it forgets in proportion to its age.
 
-        :param waits: leave it where it is, if it is more than that mean
+        That is the average by a power function of Karras et al. (https://arxiv.org/abs/2312.02696, section 3.1). A
+        plain mean of the first updates would hold what an agent did before it had learned anything.
+
+        :param waits: leave it where it is, if it is of as many updates as it is to remember
         """
         average, n = self.policy.averaged_actor, self._n_updates // self.policy_delay
-        decay = min(self.actor_averaging, 1.0 - 1.0 / n)
-        if average is None or (waits and decay == self.actor_averaging):
+        decay = min(self.actor_averaging, max(0.0, 1.0 - YOUTH / n))
+        if average is None or (waits and n * (1.0 - self.actor_averaging) >= 1.0):
             return
         polyak_update(self.actor.parameters(), average.parameters(), 1.0 - decay)
         for own, averaged in zip(self.actor.buffers(), average.buffers(), strict=True):

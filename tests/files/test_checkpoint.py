@@ -10,7 +10,7 @@ import pytest
 import torch as th
 from kill import Kill, Killed
 from stable_baselines3 import SAC
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EveryNTimesteps
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecNormalize
@@ -388,6 +388,18 @@ def test_successes_go_on_where_they_were(tmp_path):
     model.learn(30, [after], reset_num_timesteps=False)
     with np.load(tmp_path / "evaluations.npz") as saved:
         assert saved["successes"].shape == (len(saved["timesteps"]), 2) == (4, 2)
+
+
+def test_evaluations_within_another_event_go_on_as_well(tmp_path):
+    def evaluated():
+        often = EvalCallback(Monitor(delayed()), eval_freq=1, n_eval_episodes=1, log_path=tmp_path, verbose=0)
+        return often, EveryNTimesteps(20, often)
+
+    (before, event), (after, other) = evaluated(), evaluated()
+    model = make().learn(50, [event, TrainingCheckpointCallback(tmp_path, 30)])
+    restore_training(model, tmp_path / CHECKPOINT_NAME, CallbackList([other, TrainingCheckpointCallback(tmp_path)]))
+    assert after.evaluations_timesteps == before.evaluations_timesteps != []
+    assert after.best_mean_reward == before.best_mean_reward
 
 
 # ---------------------------------------------------------------------------------------------------- misfits

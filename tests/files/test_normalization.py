@@ -35,10 +35,19 @@ def test_it_normalises_as_before(saved):
     assert (loaded.gamma, loaded.clip_obs, loaded.training) == (0.9, 5.0, False)
 
 
+def test_without_clips_it_comes_back_too(tmp_path):
+    env = VecNormalize(make_vec_env(delayed), norm_obs_keys=["observation"], clip_obs=np.inf, clip_reward=np.inf)
+    save_normalization(tmp_path / "agent.normalize.zip", env)
+    loaded = load_normalization(tmp_path / "agent.normalize.zip", make_vec_env(delayed))
+    assert loaded.clip_obs == loaded.clip_reward == np.inf
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [
         ("epsilon", -5.0),
+        ("epsilon", float("inf")),
+        ("clip_obs", -float("inf")),
         ("epsilon", 0.0),
         ("epsilon", float("nan")),
         ("clip_obs", float("nan")),

@@ -369,13 +369,24 @@ def test_settings_that_do_not_fit_are_refused(kwargs, message):
         ControlLoop(Recorder(TASK, 4), **{"period": 1, "simulate": lambda seconds: 0, **kwargs})
 
 
-def test_numpys_numbers_of_a_log_are_counted_as_pythons():
-    loop = ControlLoop(Recorder(TASK, 4), 0.02, answer_steps=np.int64(1), simulate=lambda seconds: np.int64(3))
+@pytest.mark.parametrize("period", [0.02, np.float64(0.02), np.float32(0.02)])
+def test_numpys_numbers_of_a_log_are_counted_as_pythons(period):
+    loop = ControlLoop(Recorder(TASK, 4), period, answer_steps=np.int64(1), simulate=lambda seconds: np.int64(3))
     for k, now in enumerate(np.arange(8) * 0.05):
         loop.observe(ZEROS, n_executed=np.uint32(k))
         loop.act(now)
     found = loop.statistics().to_dict()
     assert found["overruns"] == 7 and found["late_answers"] > 0 and found["steps"] == 8
+
+
+def test_an_action_delay_of_few_digits_rounds_no_time_of_a_clock():
+    model = Recorder(TASK, 4)
+    loop = ControlLoop(model, 0.02, action_delay=np.float32(0.008), simulate=lambda seconds: 0)
+    for k in range(20):
+        now = 1.7e9 + 0.02 * k
+        loop.observe(ZEROS, now)
+        loop.act(now)
+    assert loop.statistics().to_dict()["age_max"] == 0
 
 
 def test_stamps_of_another_clock_are_refused():
@@ -417,6 +428,11 @@ def test_ticks_come_once_a_period_and_make_up_for_none():
     assert [next(beat), next(beat)] == [5.5, 6.5]
     with pytest.raises(ValueError, match="period is 0"):
         next(ticks(0))
+
+
+def test_ticks_of_numpys_period_sleep_for_a_number():
+    beat = ticks(np.float32(0.01))
+    assert next(beat) < next(beat)
 
 
 def test_a_looped_model_that_takes_no_time_is_asked_what_it_is_asked_without_a_loop():

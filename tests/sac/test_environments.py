@@ -41,6 +41,19 @@ def test_environments_in_processes_of_their_own(make_env, ages):
         vec.close()
 
 
+@pytest.mark.parametrize("error", [NotImplementedError, AttributeError])
+def test_a_simulator_that_knows_no_wrappers_is_taken(error, monkeypatch):
+    """As those whose environments are computed side by side on a GPU."""
+
+    def refuse(*_):
+        raise error("Checking if environment is wrapped is not supported.")
+
+    env = DummyVecEnv([Drift, Drift])
+    monkeypatch.setattr(env, "env_is_wrapped", refuse)
+    model = make(env).learn(20)
+    assert model.learn(20, reset_num_timesteps=False).num_timesteps == 40
+
+
 def test_a_normalised_environment_is_taken():
     model = make(VecNormalize(make_vec_env(delayed), norm_obs_keys=["observation"])).learn(30)
     model.set_env(other := VecNormalize(make_vec_env(delayed), norm_obs_keys=["observation"]))
