@@ -16,12 +16,13 @@ from sb3_said.zoo.folder import TUNED_SETTINGS
 from sb3_said.zoo.record import Record, evaluated
 
 
-def write_best(run: Path, folder: Path, planner: dict[str, Any], choice: str) -> str:
+def write_best(run: Path, folder: Path, planner: dict[str, Any], n_updates: int, choice: str) -> str:
     """Write the YAML of a tuned run, and return the command that trains with it.
 
     :param run: folder of the run that was tuned
     :param folder: to write to
     :param planner: its settings that the trials had beside the run's arguments
+    :param n_updates: that the planner was trained for
     :param choice: how they were chosen, for a comment
     """
     record = Record.read(run)
@@ -29,7 +30,12 @@ def write_best(run: Path, folder: Path, planner: dict[str, Any], choice: str) ->
         **record.hyperparams,
         "planner_kwargs": {**(record.hyperparams.get("planner_kwargs") or {}), **planner},
     }
-    record = replace(record, hyperparams=hyperparams)
+    options = record.options
+    if record.dataset:
+        options = {**options, "n_timesteps": n_updates}
+    elif n_updates != record.hyperparams.get("planner_gradient_steps"):
+        hyperparams["planner_gradient_steps"] = n_updates
+    record = replace(record, hyperparams=hyperparams, options=options)
     record.write(folder)  # what makes the task of best.zip
     if (statistics := normalization_file(run / record.agent_name)).exists():
         shutil.copyfile(statistics, normalization_file(folder / record.agent_name))  # of all agents there

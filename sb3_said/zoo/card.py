@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import csv
+import hashlib
 import shlex
 from pathlib import Path
 from typing import Any
@@ -147,7 +148,7 @@ def describe(
         + (f", and {n_trial_steps:,} to choose how it decides" if n_trial_steps else ""),
         "training seed": record.seed,
         "made by": f"`{made_by(record, run.model)}`",
-        "SHA-256": f"`{digest_of(run)}`",
+        "SHA-256": f"`{hashlib.sha256(file.read_bytes()).hexdigest()}`",
         **({} if run.normalize is None else {"belongs beside it": f"`{normalization_file(file).name}`"}),
         "median decision": "not measured" if latency_ms is None else f"{latency_ms:g} ms, one CPU thread",
     }

@@ -34,7 +34,7 @@ class Cell:
     algo: str
     file: str
     sha256: str
-    """of the file"""
+    """of the file, and of what its run changes in the task but the delay, if anything"""
     trained_steps: int
     obstacle: str | None
     """why the agent cannot play this delay"""
@@ -44,6 +44,8 @@ class Cell:
     """a summary without its label, which the cell has"""
     age_error: int = 0
     """control steps that the age is told wrong by, cut at 0 and at the largest that the agent was built for"""
+    is_changed: bool = False
+    """whether its run changes the task, so that no reference return is of it"""
 
     @property
     def key(self) -> tuple[str, ...]:

@@ -278,12 +278,14 @@ def play(share: Share, n_steps: int, seed: int, n_envs: int, deterministic: bool
     """
     episodes: list[Episode] = []
     kept: list[Episode] = []
-    used, left, full = 0, n_steps, bar.n + n_steps
+    used, left, n_taken = 0, n_steps, 0
 
     def on_step() -> None:
-        if bar.n < full:  # steps of the last episodes are cut off
+        nonlocal n_taken  # a bar that is not shown counts nothing
+        if n_taken < n_steps:  # steps of the last episodes are cut off
+            n_taken += 1
             bar.update()
-        if bar.n == full and n_settled(episodes) >= left:
+        if n_taken == n_steps and n_settled(episodes) >= left:
             raise ShareIsFull
 
     def make_env() -> gym.Env[Any, Any]:

@@ -134,14 +134,14 @@ def measure(args: argparse.Namespace, runs: dict[str, LoadedRun], target: Path, 
                 for summary, counts in in_time:
                     played.append((which, summary))
                     counted[label_of(which, summary)] = counts
-    print_table(played, run.info["env"])
+    print_table(played, run.scored_task)
     for label, counts in counted.items():
         print(f"{label}: {', '.join(f'{name} {value:g}' for name, value in counts.items() if 'gap' not in name)}")
 
     document = {**run.info, "n_episodes": args.episodes, **settings}
     document["results"] = [
         {**summary.to_dict(), "which": which, "trained_steps": runs[which].info["trained_steps"]}
-        | {"normalized_score": score_of(summary, run.info["env"])}
+        | {"normalized_score": score_of(summary, run.scored_task)}
         for which, summary in played
     ]
     document["origin"] = origin(run)
@@ -181,7 +181,10 @@ def label_of(which: str, summary: Summary) -> str:
 
 
 def score_of(summary: Summary, env_id: str) -> list[float] | None:
-    """Return D4RL's score of the mean return and of its interval's ends, None where there is none."""
+    """Return D4RL's score of the mean return and of its interval's ends, None where there is none.
+
+    :param env_id: of an unchanged task
+    """
     if reference_returns(env_id) is None:
         return None
     mean = summary.mean_return

@@ -191,6 +191,11 @@ class DelayedExperimentManager(ExperimentManager):
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
         """Preprocess them as rl_zoo3 does; evaluations are of the task as the YAML has it, too."""
+        if refused := [name for name in ("frame_stack", "vec_env_wrapper") if hyperparams.get(name)]:
+            raise ValueError(
+                f"{', '.join(refused)} wraps all environments at once, and no command could play the agent: put "
+                "gymnasium.wrappers.FrameStackObservation and FlattenObservation into env_wrapper, or yours."
+            )
         made = super()._preprocess_hyperparams(hyperparams)
         if self.n_envs < 1:
             raise ValueError(f"n_envs must be at least 1, got {self.n_envs}.")
@@ -385,6 +390,10 @@ class DelayedExperimentManager(ExperimentManager):
         assert isinstance(model, DelayedSAC)
         model.task = self.env_name.gym_id  # which environments in other processes do not tell
         file = self.folder / f"{self.env_name}.zip"
+        is_unfinished = self.stopping.is_asked and isinstance(model, SAID) and not model.policy.planner_is_trained
+        if is_unfinished and _has_planner(file):  # of a run that had ended, and is trained for longer
+            print(f"{file} stays as it was, with its planner.")
+            return
         print(f"Saving to {self.save_path}")
         save_with_normalization(model, file)
         if self.save_replay_buffer:
@@ -422,3 +431,11 @@ class SaveNormalization(BaseCallback):
         if (vec_normalize := self.model.get_vec_normalize_env()) is not None:
             save_normalization(self.path, vec_normalize)
         return True
+
+
+def _has_planner(file: Path) -> bool:
+    """Tell whether an agent's file has a trained planner."""
+    try:
+        return file.is_file() and SAID.load(file, device="cpu").policy.planner_is_trained
+    except SavedFileError:
+        return False

@@ -97,7 +97,8 @@ def main(argv: list[str] | None = None) -> None:
     columns, settings = list(dict.fromkeys(cell.column for cell in in_order)), Results(args.json).settings
     print_table(table, columns)
     print_seeds(shown, rows)
-    print_scores(table, columns, settings["env"])
+    changed = {rows[cell.agent] for cell in shown if cell.is_changed and cell.agent in rows}
+    print_scores({row: x for row, x in table.items() if row not in changed}, columns, settings["env"])
     print_manners(shown, rows)
     if args.plot is not None and any(table.values()):
         title = f"{settings['env']} under delay: means of {settings['n_episodes']} episodes, 95 % intervals"
@@ -170,15 +171,19 @@ def play_missing(args: argparse.Namespace, delays: list[int | str]) -> list[Cell
     first = next(iter(runs.values()))[0]
     settings = {"env": first.info["env"], "n_episodes": args.episodes, "seed": args.seed, "deterministic": True}
     results = Results(args.json, settings)
-    cells = [cell for label, row in runs.items() for cell in cells_of(label, row, delays, args.answer)]
+    errors = [0, *(error for error in dict.fromkeys(args.age_errors) if error)]
+    cells = [
+        cell
+        for error in errors
+        for label, row in runs.items()
+        for cell in cells_of(label, row, delays, args.answer, error)
+    ]
     if not cells:
         raise ValueError(
             f"There is nothing to play: no run can answer as --answer {args.answer}."
             if args.answer
             else f"There is nothing to play: no run is of the delays {', '.join(map(str, delays))}."
         )
-    errors = [0, *(error for error in dict.fromkeys(args.age_errors) if error)]
-    cells = [replace(cell, age_error=error) for error in errors for cell in cells]
     choose_rows(args.rows, cells)
     results.ask(cells)
     todo = [cell for cell in cells if cell.result is None and cell.obstacle is None]
@@ -257,11 +262,14 @@ def digest_of(run: LoadedRun) -> str:
     return hashlib.sha256(Path(run.info["file"]).read_bytes() + changes).hexdigest()
 
 
-def cells_of(label: str, row: list[LoadedRun], delays: list[int | str], only: str | None = None) -> Iterator[Cell]:
+def cells_of(
+    label: str, row: list[LoadedRun], delays: list[int | str], only: str | None = None, age_error: int = 0
+) -> Iterator[Cell]:
     """Make the cells of a label: each who can answer, under each delay.
 
     :param row: runs of one delay, which play all delays; or of several, of which each plays its own
     :param only: who of a SAID agent is to answer; by default everyone who can
+    :param age_error: control steps that the age is told wrong by
     """
     one_delay = len({run.info["delay"] for run in row}) == 1
     digests = [digest_of(run) for run in row]
@@ -276,17 +284,24 @@ def cells_of(label: str, row: list[LoadedRun], delays: list[int | str], only: st
                 answer=answer,
                 delay=delay,
                 sha256=digest,
-                obstacle=obstacle(run, answer, delay),
+                obstacle=obstacle(run, answer, delay, age_error),
+                age_error=age_error,
+                is_changed=bool(run.changes),
                 **{key: run.info[key] for key in ("algo", "file", "trained_steps")},
             )
 
 
-def obstacle(run: LoadedRun, answer: str | None, delay: int | str) -> str | None:
+def obstacle(run: LoadedRun, answer: str | None, delay: int | str, age_error: int = 0) -> str | None:
     """Say why an agent cannot play under a delay; None where it can.
 
     :param run: whose action delay, if its task has one, comes on top
     :param answer: who acts in a SAID agent
+    :param age_error: control steps that the age is told wrong by
     """
+    if age_error and longest_delay(run.model) is None:
+        return "it reads no age, so none can be told wrong"
+    if run.own_delay is not None and make_process(delay) != run.own_delay:
+        return f"its task is registered with a delay of its own, {delay_name(run.own_delay)}"
     longest, policy = longest_delay(run.model) or 0, run.model.policy
     action_delay = run.changes.get("action_delay", 0)
     low, high = (sum(ends) for ends in zip(age_range(delay), age_range(action_delay), strict=True))

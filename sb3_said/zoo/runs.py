@@ -28,6 +28,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_said import SAID, DelayedSAC, __version__
 from sb3_said.delays import DelayedObservationWrapper, DelayProcess, FixedDelay
 from sb3_said.delays.space import ages_of, has_state_history
+from sb3_said.delays.text import make_process
 from sb3_said.evaluation.rollout import Observation, Rollout, rollout
 from sb3_said.files.agents import task_of
 from sb3_said.files.archive import SavedFileError, load_metadata
@@ -58,11 +59,18 @@ class LoadedRun:
     changes: dict[str, Any] = field(default_factory=dict)
     """what its run changes in the task but the observation delay: arguments of ours, and those of other wrappers and of
     ``gymnasium.make`` by their names"""
+    own_delay: DelayProcess | None = None
+    """of a task that is registered with one, and can be played under no other"""
 
     @property
     def setting(self) -> str:
         """``changes`` as text."""
         return json.dumps(self.changes, sort_keys=True, default=repr)
+
+    @property
+    def scored_task(self) -> str:
+        """The task, where D4RL's reference returns are of it; empty where the run changes it."""
+        return "" if self.changes else str(self.info["env"])
 
     def play(self, n_episodes: int, seed: int, n_envs: int = 1, age_error: int = 0, **kwargs: Any) -> Rollout:
         """Play whole episodes, see :func:`~sb3_said.evaluation.rollout`.
@@ -138,8 +146,14 @@ def load_run(
             raise ValueError(f"{env_id} cannot be made with {kwargs}: {error}") from error
 
     task, wrappers = make_task(), record.wrappers if record is not None else []
-    if delay is not None or (record is None and _process_of(task) is None):  # a task may be registered with one
+    own_delay = _process_of(task)  # a task may be registered with one
+    if own_delay is None and (delay is not None or record is None):
         wrappers = _with_delay(wrappers, delay, model)
+    elif own_delay is not None and delay is not None and make_process(delay) != own_delay:
+        raise ValueError(
+            f"{env_id} is registered with a delay of its own, {delay_name(own_delay)}, and can be played under no "
+            "other: register it without, and train with --delay."
+        )
     wrap = make_wrapper(wrappers) or (lambda task: task)
 
     def make_env() -> gym.Env[Any, Any]:
@@ -156,7 +170,7 @@ def load_run(
     info |= {"file": str(file), "trained_steps": model.num_timesteps}
     is_normalized = bool(hyperparams.get("normalize")) or getattr(model, "reads_normalized", False)
     normalize = _load_normalize(file, record, make_env, is_normalized)
-    return LoadedRun(model, make_env, normalize, file.parent, info, changes(kwargs, wrappers))
+    return LoadedRun(model, make_env, normalize, file.parent, info, changes(kwargs, wrappers), own_delay)
 
 
 def _warn_if_unfinished(model: BaseAlgorithm, file: Path, record: Record | None) -> None:

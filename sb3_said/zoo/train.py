@@ -102,10 +102,11 @@ def main(argv: list[str] | None = None) -> None:
     with explained(parser):
         run, algo, zoo_argv = read_command_line(argv)
     if run.resume is not None and len(argv) <= 2 and (run.resume / ENDED_NAME).is_file():  # nothing else is asked for
-        print(
-            f"{run.resume} has ended, and nothing is left to do. sb3-said evaluate {run.resume} plays its agent. With "
-            "-n and more steps than it had, --resume trains it for longer."
-        )
+        print(f"{run.resume} has ended, and nothing is left to do. sb3-said evaluate {run.resume} plays its agent.")
+        if algo == "said" and run.dataset:
+            print("For more updates of a planner from logs start a new run: its learning rate falls over all of them.")
+        else:
+            print("With -n and more steps than it had, --resume trains it for longer.")
         return
     if "--help" in zoo_argv:
         parser.print_help()

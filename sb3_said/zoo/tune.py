@@ -40,6 +40,7 @@ from sb3_said.zoo.search import (
     search,
 )
 
+RESULTS_NAME = "results.json"
 EPILOG = f"""\
 examples:
   # the paper's grid: three planners are trained, each is tried at six temperatures
@@ -136,6 +137,7 @@ def tune(args: argparse.Namespace) -> None:
     began = time.monotonic()
     run, model = open_run(args)
     folder = args.output or args.run / "tune"
+    read_report(folder / RESULTS_NAME)  # what is no report is told now, and not after the trials
     dataset = Record.read(args.run).dataset
     planners = DepthPlanners(model, args.run / CHECKPOINT_NAME, folder, args.gradient_steps, args.progress, dataset)
     steps = args.sampling_steps or [planners.config.sampling_steps]
@@ -189,12 +191,25 @@ def open_run(args: argparse.Namespace) -> tuple[LoadedRun, SAID]:
     return run, run.model
 
 
+def read_report(file: Path) -> dict[str, Any]:
+    """Return what an earlier call has reported, nothing where there was none.
+
+    :raises ValueError: for a file of something else
+    """
+    try:
+        return dict(json.loads(file.read_text())["report"]) if file.is_file() else {}
+    except (ValueError, TypeError, KeyError) as error:
+        raise ValueError(
+            f"{file} holds something else than what sb3-said tune writes: give another --output."
+        ) from error
+
+
 def report(args: argparse.Namespace, run: LoadedRun, study: Study, winner: FrozenTrial, folder: Path) -> None:
     """Play the winner, which the agent has, and the expert on fresh episodes; write the files and print a summary."""
-    results = folder / "results.json"
+    results = folder / RESULTS_NAME
     fresh = {"study": study.study_name, "trial": winner.number, "finished": str(winner.datetime_complete)}
     fresh |= {"seed": args.report_seed, "n_episodes": args.report_episodes}
-    before = json.loads(results.read_text())["report"] if results.is_file() else {}
+    before = read_report(results)
     if fresh.items() <= before.items():  # by another worker, or an earlier call
         played = before["results"]
     else:
@@ -209,8 +224,9 @@ def report(args: argparse.Namespace, run: LoadedRun, study: Study, winner: Froze
     choice = f"{', '.join(winner.params)}: the best of {len(trials)} trials, mean return {winner.value:.1f} over "
     choice += f"{args.episodes} episodes; how the planner decides beyond that: as the run does"
     assert isinstance(run.model, SAID)  # as open_run saw to
-    decides = {name: getattr(run.model.policy.planner.config, name) for name in SAMPLING_SETTINGS}
-    command = write_best(args.run, folder, decides | winner.params, choice)
+    decides = {name: getattr(run.model.policy.planner.config, name) for name in ("mask", *SAMPLING_SETTINGS)}
+    n_updates = int(run.model.policy.planner_updates)
+    command = write_best(args.run, folder, decides | winner.params, n_updates, choice)
     document = {
         **run.info,
         "settings": study.user_attrs["settings"],

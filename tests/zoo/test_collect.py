@@ -21,6 +21,7 @@ from small_run import ENV, write_run
 from small_task import Drift
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from tqdm.auto import tqdm
 from trained_run import train_run
 
 from sb3_said import DelayedObservationWrapper, DelayedSAC
@@ -194,6 +195,12 @@ def own_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     yield "own_package"
     gym.registry.pop("Own-v0", None)
     sys.modules.pop("own_package", None)
+
+
+def test_a_bar_that_is_not_shown_ends_it_too(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """``TQDM_DISABLE=1`` makes one that counts nothing."""
+    monkeypatch.setattr(collect, "tqdm", lambda **given: tqdm(**{**given, "disable": True}))
+    assert len(collected(tmp_path / "log.npz", run, "random", "--steps", "30")) == 30
 
 
 def test_a_changed_task_is_said(

@@ -475,6 +475,34 @@ def test_runs_of_two_tasks_are_refused(sadr: Path, tmp_path: Path, capsys: pytes
     assert "several tasks cannot be compared" in capsys.readouterr().err
 
 
+def test_no_reference_return_is_of_a_changed_task(
+    sadr: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(REFERENCE_RETURNS, "invertedpendulum", (0.0, 1000.0))
+    other = write_run(tmp_path / "other", DelayedSAC, 2, seed=9)
+    Record("sadr", ENV, 9, 2, env_kwargs={"reset_noise_scale": 0.2}).write(other)
+    for words in ([f"plain={sadr}", f"changed={other}"], []):  # and where a file alone says so
+        over_delays.main(
+            [*words, *("--delays 1 --episodes 2 --json".split() if words else ["--json"]), str(tmp_path / "o.json")]
+        )
+        shown = capsys.readouterr().out
+        assert "changed" in shown.split("normalised score")[0]
+        scores = shown.split("normalised score")[1]
+        assert "| plain" in scores and "| changed" not in scores
+    assert (load_run(sadr).scored_task, load_run(other).scored_task) == (ENV, "")
+
+
+def test_an_agent_that_reads_no_age_is_told_none_wrong(said: Path, tmp_path: Path) -> None:
+    model = DelayedSAC("MlpPolicy", gym.make(ENV), buffer_size=10, device="cpu")
+    model.save((plain := tmp_path / "plain") / f"{ENV}.zip")
+    Record("sac", ENV, 0, None).write(plain)
+    words = [f"a={said}", f"b={plain}"]
+    cells = play(tmp_path / "out.json", words, ["0"], "--answer", "expert", "--age-errors", "1")["cells"]
+    found = {(cell["agent"], cell["age_error"]): cell["obstacle"] for cell in cells}
+    no_age = "it reads no age, so none can be told wrong"
+    assert found == {("a expert", 0): None, ("b", 0): None, ("a expert", 1): None, ("b", 1): no_age}
+
+
 def test_runs_of_a_task_that_one_of_them_changes_are_no_seeds_of_one_setting(
     sadr: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

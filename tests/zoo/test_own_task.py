@@ -103,8 +103,16 @@ def test_a_task_registered_with_its_delay_keeps_it(tmp_path: Path) -> None:
         run = tmp_path / "sadr" / "Late-v0-seed3_1"
         (copy := tmp_path / "alone.zip").write_bytes((run / "Late-v0.zip").read_bytes())
         for path in (run, copy):
-            opened = load_run(path, "sadr", "Late-v0", device="cpu")
-            assert opened.info["delay"] == 1 and opened.play(1, seed=0).lengths.tolist() == [200]
+            for delay in (None, 1):
+                opened = load_run(path, "sadr", "Late-v0", delay, device="cpu")
+                assert opened.info["delay"] == 1 and opened.play(1, seed=0).lengths.tolist() == [200]
+            with pytest.raises(ValueError, match="Late-v0 is registered with a delay of its own, 1, and can be played"):
+                load_run(path, "sadr", "Late-v0", 2, device="cpu")
+        words = [str(run), "--delays", "1", "2", "--episodes", "2", "--json", str(tmp_path / "over.json")]
+        over_delays.main(words)
+        cells = json.loads((tmp_path / "over.json").read_text())["cells"]
+        assert [cell["result"] is None for cell in cells] == [False, True]
+        assert cells[1]["obstacle"] == "its task is registered with a delay of its own, 1"
     finally:
         del gym.registry["Late-v0"]
 

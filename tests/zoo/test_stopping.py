@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -116,6 +117,20 @@ def test_a_signal_to_the_planners_training_loses_no_update(
     assert not same(run, whole)
     train.main(["--resume", str(run)])
     assert same(run, whole)
+
+
+def test_a_run_that_is_trained_for_longer_keeps_its_planner_until_it_has_another(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = Path(shutil.copytree(whole, tmp_path / "run"))
+    with monkeypatch.context() as patch:
+        signal_at(patch, StableSAC, "train", 10, signal.SIGINT)
+        with pytest.raises(SystemExit):
+            train.main(["--resume", str(run), "-n", "200"])
+    assert f"{ENV}.zip stays as it was, with its planner" in capsys.readouterr().out and same(run, whole)
+    train.main(["--resume", str(run)])
+    agent = SAID.load(run / f"{ENV}.zip", device="cpu")
+    assert agent.num_timesteps == 200 and agent.policy.planner_is_trained and not same(run, whole)
 
 
 def test_the_same_again_stops_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:

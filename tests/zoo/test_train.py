@@ -379,6 +379,7 @@ def test_says_what_is_wrong(words: str, message: str, tmp_path: Path, capsys: py
         ("-params batch_size:0", "batch_size is 0"),
         ("-params train_freq:0", "train_freq is 0"),
         ("-params n_envs:0", "n_envs must be at least 1, got 0"),
+        ("-params frame_stack:2", "frame_stack wraps all environments at once, and no command could play the agent"),
         ("-tb /dev/null/x", "/dev/null"),
     ],
 )

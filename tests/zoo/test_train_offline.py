@@ -97,6 +97,22 @@ def test_a_run_leaves_its_agent_record_log_and_evaluations(finished: tuple[str, 
     assert column in (run / "progress.csv").read_text()
 
 
+def test_what_may_follow_an_ended_run_is_said(
+    finished: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    algo, run = finished
+    copy = Path(shutil.copytree(run, tmp_path / "copy"))
+    train.main(["--resume", str(copy)])
+    shown = capsys.readouterr().out
+    assert ("trains it for longer" in shown, "start a new run" in shown) == (algo == "bc", algo == "said")
+    longer = ["--resume", str(copy), "-n", "25"]
+    if algo == "bc":
+        train.main(longer)
+    else:
+        with pytest.raises(SystemExit, match="gradient_steps was 20 and is now 25"):
+            train.main(longer)
+
+
 def test_evaluations_come_by_gradient_steps_however_many_environments_there_are(log: Path, tmp_path: Path) -> None:
     train_here(tmp_path, " ".join(command("bc", log)), *EVERY, *PARAMS["bc"], "n_envs:2")
     assert np.load(run_of(tmp_path, "bc") / "evaluations.npz")["timesteps"].tolist() == [10, 20]

@@ -51,7 +51,7 @@ def results_of(run: Path) -> dict[str, Any]:
 def settings_of(agent: Path) -> dict[str, Any]:
     """Return what a search may change of a planner, as an agent has it."""
     model: Any = load_run(agent, device="cpu").model
-    return {name: getattr(model.policy.planner.config, name) for name in ("depth", *SAMPLING_SETTINGS)}
+    return {name: getattr(model.policy.planner.config, name) for name in ("mask", "depth", *SAMPLING_SETTINGS)}
 
 
 def check_report(run: Path) -> None:
@@ -172,6 +172,23 @@ def test_a_search_for_how_the_critics_choose(run: Path) -> None:
     assert (
         read_by_train(run / "tune" / "best.yml", 2, run)["planner_kwargs"]["choice_factor"] == winner["choice_factor"]
     )
+
+
+def test_what_is_trained_with_its_yaml_is_what_won(run: Path, tmp_path: Path) -> None:
+    model: Any = load_run(run, device="cpu").model
+    mask = model.policy.planner.config.mask
+    tune.main([str(run), "--depths", "1", "--temperatures", "0", "--gradient-steps", "5", *QUICK])
+    trained = read_by_train(run / "tune" / "best.yml", 2, run)
+    assert trained["planner_gradient_steps"] == 5 and trained["planner_kwargs"]["mask"] == mask
+
+
+def test_a_file_of_something_else_is_told_before_the_search(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (run / "tune").mkdir()
+    (run / "tune" / "results.json").write_text('{"a": 1}')
+    with pytest.raises(SystemExit):
+        tune.main([str(run), "--depths", "1", "--temperatures", "0", *QUICK])
+    assert "results.json holds something else than what sb3-said tune writes" in capsys.readouterr().err
+    assert not (run / "tune" / "study.log").exists()
 
 
 def test_two_workers_share_a_study_and_train_no_depth_twice(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
