@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import runpy
+import signal
 import sys
 from collections.abc import Callable
 from multiprocessing.process import BaseProcess
@@ -28,6 +29,7 @@ def run_script(file: Path, words: list[str]) -> None:
 
 def _call(output: Path, function: Callable[..., object], *arguments: object) -> None:
     os.setpgid(0, 0)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # which a background job of a shell ignores
     with output.open("wb") as file:
         for standard in (sys.stdout, sys.stderr):
             os.dup2(file.fileno(), standard.fileno())
