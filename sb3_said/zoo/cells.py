@@ -219,8 +219,8 @@ def print_seeds(cells: Iterable[Cell], rows: Mapping[str, str]) -> None:
 
 
 def print_scores(table: Table, delays: list[int | str], env_id: str) -> None:
-    """Print the table again in D4RL's normalised scores, and nothing for a task that has none."""
-    if reference_returns(env_id) is not None:
+    """Print the table again in D4RL's normalised scores, and nothing for no rows or a task that has none."""
+    if table and reference_returns(env_id) is not None:
         scores = {
             row: {delay: np.asarray(normalized_score(x, env_id)) for delay, x in returns.items()}
             for row, returns in table.items()

@@ -185,7 +185,7 @@ def main(argv: list[str] | None = None) -> None:
                 parts.append(play(share, n_steps, first, args.n_envs, not args.stochastic, bar))
                 unused[share.name, share.noise] = 1 + max(episode.seed for episode in parts[-1])
         run = shares[0].run
-        told = [describe(share, part, run.info["env"]) for share, part in zip(shares, parts, strict=True)]
+        told = [describe(share, part) for share, part in zip(shares, parts, strict=True)]
         about = json.dumps({**origin(run), "seed": args.seed, "changes": json.loads(run.setting), "shares": told})
         data = join([episode for part in parts for episode in part])
         env = run.make_env()
@@ -333,14 +333,14 @@ def join(episodes: list[Episode]) -> Dataset:
     )
 
 
-def describe(share: Share, episodes: list[Episode], env_id: str) -> dict[str, Any]:
+def describe(share: Share, episodes: list[Episode]) -> dict[str, Any]:
     """Print what a share earned in its whole episodes, and return it in JSON types."""
     returns = [sum(episode.rewards) for episode in episodes if episode.is_whole]
     mean = float(np.mean(returns)) if returns else None
     told: dict[str, Any] = {"agent": share.name, "noise": share.noise, "episodes": len(episodes), "mean_return": mean}
     earned = "none of them whole" if mean is None else f"mean return {mean:,.1f}"
-    if mean is not None and not share.run.changes and reference_returns(env_id) is not None:
-        told["normalized_score"] = float(normalized_score(mean, env_id))
+    if mean is not None and reference_returns(task := share.run.scored_task) is not None:
+        told["normalized_score"] = float(normalized_score(mean, task))
         earned += f", normalised score {told['normalized_score']:.1f}"
     print(f"{share.name}, noise {share.noise:g}: {len(episodes)} episodes, {earned}", file=sys.stderr)
     return told

@@ -47,6 +47,7 @@ from sb3_said.zoo.stopping import Stopping, shielded
 
 LONGEST_NAME = 100  # of what a folder says of delays and logs; file systems end at 255
 
+OF_ALL_ENVIRONMENTS = "frame_stack", "vec_env_wrapper"  # of rl_zoo3; no command can play their agents
 #: What each name on the command line is: a class and the flags that make it so.
 ALGORITHMS: dict[str, tuple[type[DelayedSAC], dict[str, bool]]] = {
     "said": (SAID, {}),
@@ -191,7 +192,7 @@ class DelayedExperimentManager(ExperimentManager):
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
         """Preprocess them as rl_zoo3 does; evaluations are of the task as the YAML has it, too."""
-        if refused := [name for name in ("frame_stack", "vec_env_wrapper") if hyperparams.get(name)]:
+        if refused := [name for name in OF_ALL_ENVIRONMENTS if hyperparams.get(name)]:
             raise ValueError(
                 f"{', '.join(refused)} wraps all environments at once, and no command could play the agent: put "
                 "gymnasium.wrappers.FrameStackObservation and FlattenObservation into env_wrapper, or yours."

@@ -36,7 +36,7 @@ from sb3_said.files.normalization import load_normalization, normalization_file
 from sb3_said.said.policies import Answer
 from sb3_said.zoo.arguments import Delay, largest_delay
 from sb3_said.zoo.folder import find_agent, find_normalization
-from sb3_said.zoo.manager import ALGORITHMS
+from sb3_said.zoo.manager import ALGORITHMS, OF_ALL_ENVIRONMENTS
 from sb3_said.zoo.record import WRAPPER, Record, import_packages, make_wrapper
 
 ANSWERS = get_args(Answer)
@@ -127,7 +127,7 @@ def load_run(
     algo, env_id = str(own_algo or algo), env_id or own_task
     if env_id is None:
         raise ValueError(f"The task of {file} is not known: no run folder is around it, and it names none. Give --env.")
-    for key in ("frame_stack", "vec_env_wrapper"):
+    for key in OF_ALL_ENVIRONMENTS:
         if hyperparams.get(key):
             raise ValueError(f"{file} was trained with {key}={hyperparams[key]}, which cannot be played here.")
 
@@ -147,9 +147,9 @@ def load_run(
 
     task, wrappers = make_task(), record.wrappers if record is not None else []
     own_delay = _process_of(task)  # a task may be registered with one
-    if own_delay is None and (delay is not None or record is None):
-        wrappers = _with_delay(wrappers, delay, model)
-    elif own_delay is not None and delay is not None and make_process(delay) != own_delay:
+    if own_delay is None:
+        wrappers = wrappers if delay is None and record is not None else _with_delay(wrappers, delay, model)
+    elif delay is not None and make_process(delay) != own_delay:
         raise ValueError(
             f"{env_id} is registered with a delay of its own, {delay_name(own_delay)}, and can be played under no "
             "other: register it without, and train with --delay."

@@ -489,6 +489,8 @@ def test_no_reference_return_is_of_a_changed_task(
         assert "changed" in shown.split("normalised score")[0]
         scores = shown.split("normalised score")[1]
         assert "| plain" in scores and "| changed" not in scores
+    over_delays.main(["--rows", "changed", "--json", str(tmp_path / "o.json")])
+    assert "normalised score" not in capsys.readouterr().out  # not even its header
     assert (load_run(sadr).scored_task, load_run(other).scored_task) == (ENV, "")
 
 
