@@ -162,6 +162,8 @@ class SafeSaveMixin(OffPolicyAlgorithm):
                 f"The given policy_kwargs {kwargs['policy_kwargs']} differ from {stored} in the file, which the saved"
                 " networks were built with. Leave them out of the call."
             )
+        own = {name: repr(arguments[name]) for name in kwargs if name in arguments}
+        others = ", ".join(f"{name}={x}" for name, x in own.items() if x != repr(kwargs[name]))
         arguments = with_given(arguments, kwargs, cls.settings_arguments)
         policy = arguments.pop("policy_class", cls.policy_aliases["MlpPolicy"])
         with readable(path, explained=(ValueError, AssertionError)):  # SB3 asserts what it needs of an environment
@@ -178,7 +180,11 @@ class SafeSaveMixin(OffPolicyAlgorithm):
             with no_larger_than(saved["parameters"]["policy"]) if own_networks else contextlib.nullcontext():
                 model._setup_model()
             model._check_file(saved)
-            restore_agent(model, saved)
+            try:
+                restore_agent(model, saved)
+            except SavedFileError as error:
+                remedy = f"; it was saved with {others}: leave out of the call what its networks depend on"
+                raise SavedFileError(f"{error}{remedy if others else ''}") from error
             metadata = load_metadata(path)
             model.task, model.reads_normalized = task_of(metadata), metadata["metadata"].get("reads_normalized") is True
             if model.env is not None:

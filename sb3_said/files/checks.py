@@ -196,6 +196,6 @@ def check_names(where: str, saved: Collection[Any], own: Collection[Any], exact:
     """:raises SavedFileError: for unknown names and, if exact, where one lacks"""
     lacking, unknown = [x for x in own if x not in saved], [x for x in saved if x not in own]
     if unknown or (exact and lacking):
-        raise SavedFileError(
-            f"its part {where!r} does not fit: it lacks {lacking[:5]!s:.200} and has unknown {unknown[:5]!s:.200}"
-        )
+        found = {"lacks": lacking if exact else [], "has unknown": unknown}
+        told = " and ".join(f"{what} {names[:5]!s:.200}" for what, names in found.items() if names)
+        raise SavedFileError(f"its part {where!r} does not fit: it {told}")

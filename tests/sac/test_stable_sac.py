@@ -23,6 +23,7 @@ from torch.nn import functional as F
 
 from sb3_said import SAID, DelayedSAC, StableSAC
 from sb3_said.delays.space import UNDELAYED
+from sb3_said.files.archive import SavedFileError
 from sb3_said.sac.scaling import ReturnScale, StateNormalizer
 
 AS_SADR = {
@@ -467,3 +468,15 @@ def test_policies_are_sent_to_other_processes_as_sb3s_are(cls):
     policy = pickle.loads(pickle.dumps(model.policy))
     obs = observe()
     np.testing.assert_array_equal(*(each.predict(obs, deterministic=True)[0] for each in (policy, model.policy)))
+
+
+@pytest.mark.parametrize(
+    ("name", "saved", "asked"),
+    [("actor_averaging", 0.9998, 0.0), ("scale_rewards", True, False), ("critic_layer_norm", False, True)],
+)
+def test_a_load_with_other_networks_names_what_the_file_has(tmp_path, name, saved, asked):
+    make().save(tmp_path / "stable.zip")
+    with pytest.raises(SavedFileError, match=rf"saved with {name}={saved}: leave out") as found:
+        StableSAC.load(tmp_path / "stable.zip", **{name: asked})
+    assert "[]" not in str(found.value)
+    assert StableSAC.load(tmp_path / "stable.zip", batch_size=17).batch_size == 17
