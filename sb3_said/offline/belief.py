@@ -105,7 +105,7 @@ class RolledOutModel(LearnedBelief):
 
     def loss(self, windows: Windows, generator: th.Generator) -> th.Tensor:
         """Return the model's loss of one step; a window gives its first."""
-        return self.model.loss(self._z(windows.states[:, :2]), windows.actions[:, 0], windows.valid[:, 1])
+        return self.model.loss(self._z(windows.states[:, :2]), windows.actions[:, :1], windows.valid[:, 1:2])
 
 
 class RegressedPresent(LearnedBelief):

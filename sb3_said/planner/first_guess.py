@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from typing import Any
 
 import torch as th
 from torch import nn
@@ -11,15 +11,15 @@ from tqdm.auto import tqdm
 
 from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.normalizer import Normalizer
-from sb3_said.planner.plain import OneStepModel, plain_network
+from sb3_said.planner.plain import FARTHEST, OneStepModel, plain_network
 from sb3_said.planner.values import window_weight
-from sb3_said.replay.windows import WindowSource
+from sb3_said.replay.windows import Windows, WindowSource
 
 CLONE_WIDTH = 256
 CLONE_LEARNING_RATE = 1e-3
 GUESS_BATCH_SIZE = 256
-# Standard deviations: a model that is asked far from its data must not run away. A log without noise has falls at 31
-FARTHEST = 100.0
+# Of many steps at once: updates of one step for each, and the part of their rate. At a quarter of it, Ant-v5 loses
+ROLLED_EACH, ROLLED_RATE, ROLLED_CLIP = 16, 0.1, 1.0
 
 
 class FirstGuess(nn.Module):
@@ -79,17 +79,23 @@ def fit_first_guess(
     config: PlannerConfig,
     n_updates: int,
     generator: th.Generator,
+    longest: int,
     progress_bar: bool = False,
     should_stop: Callable[[], bool] | None = None,
     older: WindowSource | None = None,
 ) -> bool:
-    """Train the plain networks with Adam, whose rate falls to 0 by a cosine.
+    """Train the plain networks on single steps, then the model alone on as many at once as it will be rolled out over.
+
+    A model that learned single steps has never met its own answers, and fails at old observations first where a policy
+    acts on them (measured, results/what_diffusion_buys.md).
 
     :param guess: to train, on the device of the sources
     :param source: windows whose values are those that weigh them
     :param normalizer: fitted to the source
     :param config: of the planner: how windows are drawn and weighed
+    :param n_updates: on single steps
     :param generator: of the batches
+    :param longest: steps at once; at 1 the model has learned what it is used for
     :param progress_bar: show one
     :param should_stop: asked after every update
     :param older: steps that make half of each of the model's batches, and none of the clone's: what policies did ages,
@@ -97,26 +103,53 @@ def fit_first_guess(
         where they are many (results/what_diffusion_buys.md)
     :return: whether all updates were made
     """
-    guess.model.move_std.copy_(normalizer.move_std[0])
-    groups: list[dict[str, Any]] = [
-        {"params": [*guess.model.parameters()], "lr": OneStepModel.learning_rate},
-        {"params": [*guess.clone.parameters()], "lr": CLONE_LEARNING_RATE},
-    ]
-    optimizer = th.optim.Adam(groups, fused=True)
-    scheduler = th.optim.lr_scheduler.CosineAnnealingLR(optimizer, n_updates)
-    for _ in tqdm(range(n_updates), desc="first guess", disable=not progress_bar):
-        windows = source.sample(GUESS_BATCH_SIZE, 2, generator, config.early_probability)
-        states, actions, valid, values = windows
-        states = normalizer.normalize_states(states)
-        loss = guess.clone_loss(states[:, 0], actions[:, 0], window_weight(values, config.weight_factor))
+    model, clone = guess.model, guess.clone
+    model.move_std.copy_(normalizer.move_std[0])
+
+    def draw(length: int) -> Windows:
+        return source.sample(GUESS_BATCH_SIZE, length, generator, config.early_probability)
+
+    def model_loss(windows: Windows) -> th.Tensor:
         if older is not None:
-            half = GUESS_BATCH_SIZE // 2
-            old = older.sample(half, 2, generator, config.early_probability)
-            states = th.cat([states[:half], normalizer.normalize_states(old.states)])
-            actions, valid = th.cat([actions[:half], old.actions]), th.cat([valid[:half], old.valid])
-        loss = loss + guess.model.loss(states, actions[:, 0], valid[:, 1])
+            half, length = GUESS_BATCH_SIZE // 2, windows.states.shape[1]
+            old = older.sample(half, length, generator, config.early_probability)
+            windows = Windows(*(th.cat([new[:half], x]) for new, x in zip(windows, old, strict=True)))
+        states, actions, valid, _ = windows
+        return model.loss(normalizer.normalize_states(states), actions[:, :-1], valid[:, 1:])
+
+    def both_losses() -> th.Tensor:
+        windows = draw(2)
+        state = normalizer.normalize_states(windows.states[:, 0])
+        weight = window_weight(windows.values, config.weight_factor)
+        return guess.clone_loss(state, windows.actions[:, 0], weight) + model_loss(windows)
+
+    rate, asked = OneStepModel.learning_rate, (progress_bar, should_stop)
+    rates = {model: rate, clone: CLONE_LEARNING_RATE}
+    if not _descend(both_losses, rates, math.inf, n_updates, "first guess", *asked):
+        return False
+    if longest == 1:
+        return True
+    rates, n_updates = {model: ROLLED_RATE * rate}, -(-n_updates // ROLLED_EACH)
+    return _descend(lambda: model_loss(draw(longest + 1)), rates, ROLLED_CLIP, n_updates, f"{longest} steps", *asked)
+
+
+def _descend(
+    loss: Callable[[], th.Tensor],
+    rates: dict[nn.Module, float],
+    clip: float,
+    n_updates: int,
+    name: str,
+    progress_bar: bool,
+    should_stop: Callable[[], bool] | None,
+) -> bool:
+    """Make updates of Adam, whose rates fall to 0 by a cosine; return whether all were made."""
+    optimizer = th.optim.Adam([{"params": [*x.parameters()], "lr": rate} for x, rate in rates.items()], fused=True)
+    scheduler = th.optim.lr_scheduler.CosineAnnealingLR(optimizer, n_updates)
+    for _ in tqdm(range(n_updates), desc=name, disable=not progress_bar):
         optimizer.zero_grad()
-        loss.backward()
+        loss().backward()
+        for network in rates:
+            th.nn.utils.clip_grad_norm_(network.parameters(), clip)
         optimizer.step()
         scheduler.step()
         if should_stop is not None and should_stop():

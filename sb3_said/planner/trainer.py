@@ -82,6 +82,7 @@ class PlannerTrainer:
     :param held_out: fraction of the data that is kept for ``evaluate``, see ``WindowSource.split``; 0 for none
     :param seed: of every draw
     :param older: windows of other steps, of which the first guess's model learns, too
+    :param guess_steps: steps that this model learns at once at last, in place of single ones
     :raises ValueError: when ``source`` does not fit the planner, or cannot be split
     """
 
@@ -93,16 +94,17 @@ class PlannerTrainer:
         held_out: float = 0.05,
         seed: int = 0,
         older: WindowSource | None = None,
+        guess_steps: int = 1,
     ) -> None:
         if (source.obs_dim, source.act_dim) != (planner.obs_dim, planner.act_dim):
             raise ValueError(
                 f"The planner expects {planner.obs_dim} observation and {planner.act_dim} action entries, but the "
                 f"windows have {source.obs_dim} and {source.act_dim}; build the planner for this data."
             )
-        if gradient_steps < 1 or not 0.0 <= held_out < 1.0:
+        if gradient_steps < 1 or guess_steps < 1 or not 0.0 <= held_out < 1.0:
             raise ValueError(
-                "Training needs gradient_steps >= 1 and held_out in [0, 1), but they are "
-                f"{gradient_steps} and {held_out}."
+                "Training needs gradient_steps >= 1, guess_steps >= 1 and held_out in [0, 1), but they are "
+                f"{gradient_steps}, {guess_steps} and {held_out}."
             )
         self.planner = planner
         self.config = planner.config
@@ -125,6 +127,7 @@ class PlannerTrainer:
         values = scaled_values(training_source.values, self.config.value_scale)
         self.source = replace(training_source, values=values).to(self.device)
         self.older = older
+        self.guess_steps = guess_steps
         self._is_own = self.config.mask == "own" and source.ages is not None
         sizes = planner.obs_dim, planner.act_dim, planner.max_delay
         with th.random.fork_rng(devices=[]):  # initial weights are the only draws that take no generator
@@ -197,6 +200,7 @@ class PlannerTrainer:
             self.config,
             n_updates,
             self.generator,
+            self.guess_steps,
             progress_bar=progress_bar,
             should_stop=should_stop,
             older=None if older is None else older.to(self.device),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -11,9 +12,11 @@ from hypothesis import strategies as st
 from linear_system import ACTION_DIM, BEHAVIOUR_GAIN, STATE_DIM, make_source, next_state, present
 
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
+from sb3_said.planner import first_guess as first_guess_module
 from sb3_said.planner import trainer as trainer_module
-from sb3_said.planner.first_guess import FARTHEST, FirstGuess, fit_first_guess
+from sb3_said.planner.first_guess import ROLLED_EACH, FirstGuess, fit_first_guess
 from sb3_said.planner.normalizer import Normalizer
+from sb3_said.planner.plain import FARTHEST
 from sb3_said.planner.trainer import PlannerTrainer
 
 D, HORIZON = 4, 3
@@ -90,7 +93,7 @@ def test_it_learns_a_linear_system_and_its_behaviour():
     windows = source.sample(2_000, L, generator)
     normalizer.fit_moves(windows)
     guess = make_guess()
-    fit_first_guess(guess, source, normalizer, PlannerConfig(weight_factor=0.0), 150, generator)
+    fit_first_guess(guess, source, normalizer, PlannerConfig(weight_factor=0.0), 150, generator, D)
     reaches = windows.valid[:, D]
     states, actions = windows.states[reaches], windows.actions[reaches]
     n = len(states)
@@ -103,6 +106,26 @@ def test_it_learns_a_linear_system_and_its_behaviour():
     assert (made[:, D, STATE_DIM:] - behaviour).abs().mean() < 0.3 * behaviour.abs().mean()
 
 
+def test_the_model_learns_from_its_own_answers_and_the_clone_does_not(monkeypatch):
+    """From one guess on, so many steps at once bring the model nearer after so many."""
+    monkeypatch.setattr(first_guess_module, "ROLLED_EACH", 1)
+    source, windows_of = make_source(), th.Generator().manual_seed(1)
+    normalizer = Normalizer(STATE_DIM, ACTION_DIM, L, "standard", relative_states=True)
+    normalizer.fit(source.start_states(), source.start_actions())
+    windows = source.sample(4_000, D + 1, windows_of)
+    normalizer.fit_moves(source.sample(2_000, L, windows_of))
+    states = normalizer.normalize_states(windows.states)
+    losses, clones = [], []
+    for longest in (1, D):
+        guess, generator = make_guess(), th.Generator().manual_seed(0)
+        assert fit_first_guess(guess, source, normalizer, PlannerConfig(), 150, generator, longest)
+        with th.no_grad():
+            losses.append(guess.model.loss(states, windows.actions[:, :-1], windows.valid[:, 1:]).item())
+        clones.append(guess.clone.state_dict())
+    assert losses[1] < 0.9 * losses[0], losses
+    assert all(th.equal(weight, clones[1][name]) for name, weight in clones[0].items())
+
+
 def test_the_clone_does_what_weighs_more_and_moves_are_the_data_s():
     """Half of the windows do 0.8 at value 1, the others -0.8 at value 0: at beta 3 the first weigh 20 times as much."""
     source, generator = make_source(40, 20), th.Generator().manual_seed(0)
@@ -113,7 +136,7 @@ def test_the_clone_does_what_weighs_more_and_moves_are_the_data_s():
     normalizer.fit(source.start_states(), source.start_actions())
     normalizer.fit_moves(source.sample(1_000, L, generator))
     guess = make_guess()
-    fit_first_guess(guess, source, normalizer, PlannerConfig(weight_factor=3.0), 150, generator)
+    fit_first_guess(guess, source, normalizer, PlannerConfig(weight_factor=3.0), 150, generator, D)
     assert th.equal(guess.model.move_std, normalizer.move_std[0]) and not th.allclose(guess.model.move_std, th.ones(2))
     with th.no_grad():
         done = guess.clone(normalizer.normalize_states(source.start_states())).mean()
@@ -134,7 +157,7 @@ def test_older_steps_teach_the_model_and_not_the_clone():
     errors, clones = {}, {}
     for name, given_older in (("newest alone", None), ("both", older)):
         guess, generator = make_guess(), th.Generator().manual_seed(0)
-        fit_first_guess(guess, newest, normalizer, PlannerConfig(), 100, generator, older=given_older)
+        fit_first_guess(guess, newest, normalizer, PlannerConfig(), 100, generator, D, older=given_older)
         states, actions = (2 * th.rand(500, n, generator=generator) - 1 for n in (STATE_DIM, ACTION_DIM))
         with th.no_grad():
             z = normalizer.normalize_states(states)
@@ -150,7 +173,7 @@ def make_trainer(gradient_steps: int = 12, **changes) -> PlannerTrainer:
     with th.random.fork_rng(devices=[]):
         th.manual_seed(0)
         planner = InpaintingPlanner(STATE_DIM, ACTION_DIM, D, PlannerConfig(**{**small, **changes}))
-    return PlannerTrainer(planner, make_source(40, 20), gradient_steps)
+    return PlannerTrainer(planner, make_source(40, 20), gradient_steps, guess_steps=D)
 
 
 def test_a_training_with_it_resumes_bit_for_bit():
@@ -180,14 +203,18 @@ def test_it_takes_no_more_updates_than_planner_and_data_are_worth(gradient_steps
     monkeypatch.setattr(trainer_module, "GUESS_UPDATES", most)
     trainer, asked = make_trainer(gradient_steps), []
     trainer.make_first_guess(should_stop=lambda: bool(asked.append(0)))
-    passes = 256 * len(asked) / len(trainer.source)
-    assert len(asked) == 5 * gradient_steps or len(asked) == most or 50 <= passes < 50.5
+    n_updates = next(n for n in range(len(asked)) if n + math.ceil(n / ROLLED_EACH) == len(asked))
+    passes = 256 * n_updates / len(trainer.source)
+    assert n_updates == 5 * gradient_steps or n_updates == most or 50 <= passes < 50.5
 
 
 def test_it_can_be_stopped():
     trainer, asked = make_trainer(), []
     assert not trainer.make_first_guess(should_stop=lambda: asked.append(0) or len(asked) == 3)
     assert len(asked) == 3 and trainer.n_updates == 0
+    trainer, asked, late = make_trainer(), [], 61  # 60 are of single steps
+    assert not trainer.make_first_guess(should_stop=lambda: asked.append(0) or len(asked) == late)
+    assert len(asked) == late and trainer.n_updates == 0
     assert make_trainer().make_first_guess(should_stop=lambda: False)
     assert make_trainer(first_guess="none").make_first_guess(should_stop=lambda: True)  # there is nothing to make
 

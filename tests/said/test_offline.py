@@ -111,6 +111,14 @@ def test_all_of_a_log_is_learned_from_and_then_the_newest_part_of_its_own_steps_
     assert 0.9 * 12 < len(model.make_planner_trainer(1).source) <= 12
 
 
+def test_a_guess_learns_many_steps_at_once_from_its_own_steps_and_single_ones_from_a_log():
+    model = learn(steps=1)
+    assert model.make_planner_trainer(1).guess_steps == 1
+    with pytest.warns(UserWarning, match="no longer holds the dataset"):
+        model.learn(60)
+    assert model.make_planner_trainer(1).guess_steps == model.policy.max_delay > 1
+
+
 def test_candidates_are_scored_by_v_alone(learned, monkeypatch):
     monkeypatch.setattr(type(learned.policy), "q_value", lambda *_: pytest.fail("asked the critics"))
     obs, before = observe(), answer(learned, observe())
