@@ -29,14 +29,15 @@ D = 3
 
 
 def make_trainer(
-    gradient_steps=12, held_out=0.1, seed=0, source=None, max_delay=D, device="cpu", **config
+    gradient_steps=12, held_out=0.1, seed=0, source=None, max_delay=D, device="cpu", guess_steps=1, **config
 ) -> PlannerTrainer:
     defaults = dict(depth=1, d_model=32, horizon=3, batch_size=16, warmup_steps=4, learning_rate=1e-3, sampling_steps=2)
     defaults |= dict(first_guess="none")  # test_first_guess.py has those with one
     with th.random.fork_rng(devices=[]):
         th.manual_seed(seed)
         planner = InpaintingPlanner(STATE_DIM, ACTION_DIM, max_delay, PlannerConfig(**{**defaults, **config}))
-    return PlannerTrainer(planner.to(device), source or make_source(40, 20), gradient_steps, held_out, seed)
+    source = source or make_source(40, 20)
+    return PlannerTrainer(planner.to(device), source, gradient_steps, held_out, seed, guess_steps=guess_steps)
 
 
 def leaves(tree, path=""):
@@ -631,9 +632,11 @@ def test_every_training_starts_anew():
     assert_same(dict(other.planner.state_dict()), dict(whole.planner.state_dict()))
 
 
-@pytest.mark.parametrize("arguments", [{"gradient_steps": 0}, {"held_out": 1.0}, {"held_out": -0.1}])
+@pytest.mark.parametrize(
+    "arguments", [{"gradient_steps": 0}, {"held_out": 1.0}, {"held_out": -0.1}, {"guess_steps": 0}]
+)
 def test_bad_arguments(arguments):
-    with pytest.raises(ValueError, match="gradient_steps >= 1 and held_out"):
+    with pytest.raises(ValueError, match="gradient_steps >= 1, guess_steps >= 1 and held_out"):
         make_trainer(**arguments)
 
 

@@ -1,6 +1,7 @@
 """Training the planner: when, on what, with what to watch it by, and on from where it was interrupted."""
 
 import io
+import math
 import warnings
 
 import gymnasium as gym
@@ -17,6 +18,7 @@ from sb3_said.files.archive import SavedFileError, load_tree, save_tree
 from sb3_said.files.checkpoint import TrainingCheckpointCallback, restore_training
 from sb3_said.planner import InpaintingPlanner
 from sb3_said.planner import trainer as trainer_module
+from sb3_said.planner.first_guess import ROLLED_EACH
 from sb3_said.planner.trainer import GUESS_UPDATES_EACH, PlannerTrainer
 from sb3_said.said import training
 from sb3_said.said.training import PLANNER_CHECKPOINT_NAME
@@ -370,11 +372,11 @@ def test_the_planners_checkpoints_are_spread_by_time_and_size(tmp_path, monkeypa
 
 def test_a_stop_amid_one_of_several_trainings_loses_no_update(tmp_path, trainings, monkeypatch):
     monkeypatch.setattr(trainer_module, "GUESS_PASSES", 10_000)  # so that few rows do not end it
-    asked = []
+    asked, of_guess = [], 6 * GUESS_UPDATES_EACH  # of single steps; then of many
 
     def should_stop():
         asked.append(True)
-        return len(asked) == 6 * GUESS_UPDATES_EACH + 4  # of six updates the fourth, after those of the guess
+        return len(asked) == of_guess + math.ceil(of_guess / ROLLED_EACH) + 4  # of six updates the fourth
 
     checkpointing = TrainingCheckpointCallback(tmp_path, 1000)
     with pytest.raises(KeyboardInterrupt):
