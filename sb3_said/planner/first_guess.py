@@ -18,7 +18,8 @@ from sb3_said.replay.windows import Windows, WindowSource
 CLONE_WIDTH = 256
 CLONE_LEARNING_RATE = 1e-3
 GUESS_BATCH_SIZE = 256
-# Of many steps at once: updates of one step for each, and the part of their rate. At a quarter of it, Ant-v5 loses
+# Of many steps at once: updates of one step for each, the part of their rate (at a quarter an Ant-v5 lost a third of
+# its return, results/what_diffusion_buys.md), and the largest norm of a gradient
 ROLLED_EACH, ROLLED_RATE, ROLLED_CLIP = 16, 0.1, 1.0
 
 
@@ -95,7 +96,7 @@ def fit_first_guess(
     :param config: of the planner: how windows are drawn and weighed
     :param n_updates: on single steps
     :param generator: of the batches
-    :param longest: steps at once; at 1 the model has learned what it is used for
+    :param longest: steps that the model will be rolled out over; at 1 there is no second part
     :param progress_bar: show one
     :param should_stop: asked after every update
     :param older: steps that make half of each of the model's batches, and none of the clone's: what policies did ages,
