@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import torch as th
@@ -126,7 +125,7 @@ def fit_first_guess(
 
     rate, asked = OneStepModel.learning_rate, (progress_bar, should_stop)
     rates = {model: rate, clone: CLONE_LEARNING_RATE}
-    if not _descend(both_losses, rates, math.inf, n_updates, "first guess", *asked):
+    if not _descend(both_losses, rates, None, n_updates, "first guess", *asked):
         return False
     if longest == 1:
         return True
@@ -137,7 +136,7 @@ def fit_first_guess(
 def _descend(
     loss: Callable[[], th.Tensor],
     rates: dict[nn.Module, float],
-    clip: float,
+    clip: float | None,
     n_updates: int,
     name: str,
     progress_bar: bool,
@@ -149,8 +148,9 @@ def _descend(
     for _ in tqdm(range(n_updates), desc=name, disable=not progress_bar):
         optimizer.zero_grad()
         loss().backward()
-        for network in rates:
-            th.nn.utils.clip_grad_norm_(network.parameters(), clip)
+        if clip is not None:
+            for network in rates:
+                th.nn.utils.clip_grad_norm_(network.parameters(), clip)
         optimizer.step()
         scheduler.step()
         if should_stop is not None and should_stop():
