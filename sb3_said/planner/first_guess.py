@@ -10,7 +10,7 @@ from tqdm.auto import tqdm
 
 from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.normalizer import Normalizer
-from sb3_said.planner.plain import FARTHEST, OneStepModel, plain_network
+from sb3_said.planner.plain import OneStepModel, plain_network
 from sb3_said.planner.values import window_weight
 from sb3_said.replay.windows import Windows, WindowSource
 
@@ -53,7 +53,7 @@ class FirstGuess(nn.Module):
         length, state = states.shape[1], states[:, 0]
         guessed = [state]
         for k in range(longest):
-            follows = self.model(state, actions[:, k]).clamp(-FARTHEST, FARTHEST)
+            follows = self.model(state, actions[:, k])
             follows = th.where(known[:, k + 1, None], states[:, k + 1], follows)
             state = th.where((k < delay)[:, None], follows, state)
             guessed.append(state)

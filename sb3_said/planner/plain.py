@@ -74,12 +74,12 @@ class OneStepModel(nn.Module):
         self.register_buffer("move_std", th.ones(obs_dim))
 
     def forward(self, state: th.Tensor, action: th.Tensor) -> th.Tensor:
-        """Return the states that follow: (B, obs_dim).
+        """Return the states that follow: (B, obs_dim), no entry beyond FARTHEST.
 
         :param state: (B, obs_dim), z-scored
         :param action: (B, act_dim), in [-1, 1]
         """
-        return state + self.move_std * self.net(th.cat([state, action], dim=-1))
+        return (state + self.move_std * self.net(th.cat([state, action], dim=-1))).clamp(-FARTHEST, FARTHEST)
 
     def loss(self, states: th.Tensor, actions: th.Tensor, follows: th.Tensor) -> th.Tensor:
         """Return the mean over steps and entries of log(1 + e / RIGHT), e an entry's mean squared error, in moves.
@@ -94,7 +94,7 @@ class OneStepModel(nn.Module):
         """
         state, losses = states[:, 0], []
         for k in range(actions.shape[1]):
-            state = self(state, actions[:, k]).clamp(-FARTHEST, FARTHEST)
+            state = self(state, actions[:, k])
             error = ((state - states[:, k + 1]) / self.move_std) ** 2 * follows[:, k, None]  # (B, obs_dim)
             losses.append((error.sum(0) / follows[:, k].sum().clamp(min=1) / RIGHT).log1p().mean())
         return th.stack(losses).mean()

@@ -21,6 +21,7 @@ from sb3_said.offline.belief import (
     belief_error,
     train_belief,
 )
+from sb3_said.planner.plain import FARTHEST
 
 DELAY = 3
 
@@ -64,6 +65,14 @@ def test_a_learned_belief_knows_a_deterministic_task(learned):
     assert max(errors) < 0.15 and all(e < 0.25 * s for e, s in zip(errors[1:], stale[1:], strict=True))
     if isinstance(learned, RolledOutModel):
         assert errors[0] == pytest.approx(0, abs=1e-6) and errors == sorted(errors)  # they compound
+
+
+@th.no_grad()
+def test_a_model_that_runs_away_is_stopped():
+    belief = RolledOutModel(2, 1, DELAY)
+    belief.model.net[-1].weight *= 1e30
+    present = belief.present(th.randn(4, 2), th.rand(4, DELAY, 1), th.arange(4))
+    assert present[1:].abs().min() == present[1:].abs().max() == FARTHEST
 
 
 class Stale(Truth):

@@ -12,7 +12,6 @@ import torch.nn.functional as F
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner import planner as planner_module
 from sb3_said.planner.diffusion import END_TIMES, START_TIME
-from sb3_said.planner.first_guess import FARTHEST
 
 OBS, ACT, DELAY, N = 4, 2, 3, 8
 CONFIG = PlannerConfig(
@@ -99,7 +98,7 @@ def naive_guess(planner, observation, history, d):
         action = planner.first_guess.clone(state).clamp(-1, 1) if k >= d else th.zeros(ACT)
         rows.append(th.cat([state, action]))
         if k < d:
-            state = planner.first_guess.model(state, history[DELAY - d + k]).clamp(-FARTHEST, FARTHEST)
+            state = planner.first_guess.model(state, history[DELAY - d + k])
     return th.stack(rows)
 
 
