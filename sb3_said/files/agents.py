@@ -25,6 +25,7 @@ from sb3_said.files.arguments import (
     check_noise,
     from_data,
     instead_of,
+    replaced,
     space_as_data,
     space_from_data,
     with_given,
@@ -162,8 +163,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
                 f"The given policy_kwargs {kwargs['policy_kwargs']} differ from {stored} in the file, which the saved"
                 " networks were built with. Leave them out of the call."
             )
-        own = {name: repr(arguments[name]) for name in kwargs if name in arguments}
-        others = ", ".join(f"{name}={x}" for name, x in own.items() if x != repr(kwargs[name]))
+        others = ", ".join(f"{name}={value!r}" for name, value in replaced(arguments, kwargs).items())
         arguments = with_given(arguments, kwargs, cls.settings_arguments)
         policy = arguments.pop("policy_class", cls.policy_aliases["MlpPolicy"])
         with readable(path, explained=(ValueError, AssertionError)):  # SB3 asserts what it needs of an environment

@@ -140,6 +140,19 @@ def space_from_data(node: Any) -> spaces.Space[Any]:
     return spaces.Box(low, high, dtype=low.dtype)
 
 
+def replaced(settings: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings in whose place others are given; of those that have names themselves, these alone."""
+    others = {}
+    for name in (x for x in given if x in settings):
+        before, now = settings[name], given[name]
+        if isinstance(before, dict) and isinstance(now, dict):
+            if entries := replaced(before, now):
+                others[name] = entries
+        elif repr(before) != repr(now):
+            others[name] = before
+    return others
+
+
 def with_given(settings: dict[str, Any], given: dict[str, Any], nested: Iterable[str]) -> dict[str, Any]:
     """Return settings with those given in their place.
 

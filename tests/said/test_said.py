@@ -355,6 +355,13 @@ def test_settings_that_are_given_to_load_leave_the_others_as_the_file_has_them(t
     assert loaded.iql_kwargs == asdict(IQLConfig(updates=5))
 
 
+def test_a_load_with_another_planner_names_what_the_file_has_of_it(trained, saved):
+    depth = trained.planner_kwargs["depth"]
+    asked = {"depth": depth + 1, "horizon": trained.planner_kwargs["horizon"]}
+    with pytest.raises(SavedFileError, match=rf"saved with planner_kwargs=\{{'depth': {depth}\}}: leave out"):
+        SAID.load(saved, planner_kwargs=asked, device="cpu")
+
+
 def test_only_an_untrained_planner_may_be_of_other_settings(trained, tmp_path):
     expert, deeper = make(seed=4), make(planner_kwargs={"depth": 2})
     expert.save(tmp_path / "expert")
