@@ -12,8 +12,8 @@ from sb3_said.delays.processes import (
     BaseProcess,
     Delay,
     as_process,
-    check_probability,
     checked_count,
+    checked_probability,
     packet_delays,
     smallest_age,
 )
@@ -48,8 +48,8 @@ class HeldDelay(_OfProcess):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_probability("hold_prob", self.hold_prob)
-        self._set(update_period=checked_count("update_period", self.update_period, 1))
+        hold_prob = checked_probability("hold_prob", self.hold_prob)
+        self._set(hold_prob=hold_prob, update_period=checked_count("update_period", self.update_period, 1))
 
     def sample(self, rng: np.random.Generator) -> Iterator[int | None]:
         phase = int(rng.integers(self.update_period))
@@ -108,9 +108,8 @@ class DroppedPackets(_OfProcess):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_probability("p", self.p)
-        max_losses = checked_count("max_losses", self.max_losses, 1)
-        self._set(max_losses=max_losses, max_delay=self.max_delay + max_losses)
+        p, max_losses = checked_probability("p", self.p), checked_count("max_losses", self.max_losses, 1)
+        self._set(p=p, max_losses=max_losses, max_delay=self.max_delay + max_losses)
 
     def sample(self, rng: np.random.Generator) -> Iterator[int | None]:
         for delay in packet_delays(self.process, rng):

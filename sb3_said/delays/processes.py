@@ -182,7 +182,7 @@ class RandomWalkDelay(_Range):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_probability("move_prob", self.move_prob)
+        self._set(move_prob=checked_probability("move_prob", self.move_prob))
 
     def sample(self, rng: np.random.Generator) -> Iterator[int]:
         delay = int(rng.integers(self.low, self.high + 1))
@@ -262,10 +262,11 @@ def _checked_draw(process: DelayProcess, delay: int) -> int:
     return int(delay)
 
 
-def check_probability(name: str, p: float) -> None:
-    """Refuse a number outside 0..1 with a ``ValueError``."""
+def checked_probability(name: str, p: float) -> float:
+    """Return a number as a ``float``; refuse one outside 0..1 with a ``ValueError``."""
     if not 0.0 <= p <= 1.0:
         raise ValueError(f"{name} is a probability in 0..1, got {p}.")
+    return float(p)
 
 
 def checked_count(name: str, n: int, smallest: int, largest: int = 10**9) -> int:

@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.envs.registration import EnvSpec
 from hypothesis import given, settings
 from random_processes import processes
 
@@ -13,6 +14,7 @@ from sb3_said.delays import (
     EpisodeDelay,
     FixedDelay,
     HeldDelay,
+    RandomWalkDelay,
     TotalDelay,
     UniformDelay,
 )
@@ -24,6 +26,16 @@ from sb3_said.delays.text import age_range, make_process, parse_process
 @given(processes())
 def test_what_a_process_prints_reads_back(process):
     assert parse_process(repr(process)) == process
+
+
+@pytest.mark.parametrize("number", [np.float64, np.float32])
+def test_numbers_of_numpy_are_python_s(number):
+    p = number(0.25)
+    for process in (DroppedPackets(4, p), HeldDelay(4, hold_prob=p), RandomWalkDelay(0, 4, move_prob=p)):
+        assert parse_process(repr(process)) == process
+    env = DelayedObservationWrapper(gym.make("Pendulum-v1"), DroppedPackets(4, p))
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    assert again.observation_space == env.observation_space
 
 
 def test_processes_of_processes():
