@@ -39,6 +39,8 @@ from sb3_said.files.checks import (
     no_larger_than,
 )
 
+LARGEST_COUNT = 2**63 - 1
+
 SelfSafeSave = TypeVar("SelfSafeSave", bound="SafeSaveMixin")
 SelfSafePolicy = TypeVar("SelfSafePolicy", bound="SafePolicyMixin")
 
@@ -103,9 +105,8 @@ class SafeSaveMixin(OffPolicyAlgorithm):
             parameters = tree["parameters"]
             tree["parameters"] = {name: {} if "optimizer" in name else part for name, part in parameters.items()}
             tree["parameters"]["policy"] = {name: _in_half(value) for name, value in parameters["policy"].items()}
-        if isinstance(path, (str, os.PathLike)) and pathlib.Path(path).suffix == "":
-            path = f"{os.fspath(path)}.zip"
-        save_tree(path, tree, {"task": self.task, "reads_normalized": self.reads_normalized}, kind=type(self).__name__)
+        metadata = {"task": self.task, "reads_normalized": self.reads_normalized}
+        save_tree(with_suffix(path, ".zip"), tree, metadata, kind=type(self).__name__)
 
     @classmethod
     def load(  # type: ignore[override]  # of files, too, that are open
@@ -233,7 +234,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
         for base in cls.__mro__[: cls.__mro__.index(OffPolicyAlgorithm)]:
             if "__init__" in vars(base):
                 parameters = inspect.signature(base).parameters.values()
-                names |= {p.name for p in parameters if p.kind is not p.VAR_KEYWORD}
+                names |= {p.name for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
         return names - {"self", "policy", "env", "device", "tensorboard_log", "_init_setup_model"}
 
     @classmethod
@@ -320,10 +321,11 @@ def agent_state(model: SafeSaveMixin) -> dict[str, Any]:
 
 
 def _plain(name: str, value: Any) -> Any:
-    """Return a counter as a file has it: ``learn(1e6)`` and NumPy's numbers leave others."""
+    """Return a counter as a file has it: ``learn(1e6)``, ``learn(inf)`` and NumPy's numbers leave others."""
     value = value.item() if isinstance(value, np.generic) else value
-    is_count = name != "_current_progress_remaining" and isinstance(value, float) and value.is_integer()
-    return int(value) if is_count else value
+    if name == "_current_progress_remaining" or not isinstance(value, float):
+        return value
+    return min(math.ceil(value), LARGEST_COUNT) if math.isfinite(value) else LARGEST_COUNT
 
 
 def restore_agent(model: SafeSaveMixin, saved: dict[str, Any]) -> None:
@@ -347,7 +349,7 @@ def _check_counters(model: SafeSaveMixin, saved: dict[str, Any]) -> None:
     for name in model.counters:
         value, own = saved[name], getattr(model, name)
         if isinstance(own, int):
-            fits = type(value) is int and 0 <= value < 2**63
+            fits = type(value) is int and 0 <= value <= LARGEST_COUNT
         elif isinstance(own, float):
             fits = type(value) is float and math.isfinite(value)
         else:  # ages, where it has learned
@@ -393,6 +395,12 @@ def _take_parameters(model: SafeSaveMixin, saved: dict[str, Any], exact: bool = 
             target.load_state_dict({**target.state_dict(), "state": state})
         else:
             target.load_state_dict(state, strict=exact)
+
+
+def with_suffix(path: PathOrFile, suffix: str) -> PathOrFile:
+    """Add a suffix to the path of a new file that has none, as SB3 does."""
+    has_none = isinstance(path, (str, os.PathLike)) and pathlib.Path(path).suffix == ""
+    return f"{os.fspath(path)}{suffix}" if has_none else path  # type: ignore[arg-type]
 
 
 def existing(path: PathOrFile, suffix: str = ".zip") -> PathOrFile:

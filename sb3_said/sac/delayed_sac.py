@@ -29,7 +29,7 @@ from stable_baselines3.common.vec_env import (
 
 from sb3_said.delays.space import WRAPPER_ORDER, ages_of, check_one_max_delay, check_spaces, written_ages
 from sb3_said.delays.wrapper import DelayedObservationWrapper
-from sb3_said.files.agents import SafeSaveMixin, existing
+from sb3_said.files.agents import SafeSaveMixin, existing, with_suffix
 from sb3_said.files.archive import load_tree, readable, save_tree
 from sb3_said.files.checks import RANGES, check_range
 from sb3_said.replay.buffer import DelayedReplayBuffer
@@ -145,7 +145,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
         env = None if self.env is None else self.env.unwrapped
         if isinstance(env, DummyVecEnv) and env.envs[0].spec is not None:
             self.task = env.envs[0].spec.id
-        elif env is not None and env.has_attr("task_id"):
+        elif env is not None and _has_attr(env, "task_id"):
             found = env.get_attr("task_id", 0)[0]  # of a wrapper of ours; a task may mean something else by it
             self.task = found if isinstance(found, str) else self.task
 
@@ -182,6 +182,9 @@ class DelayedSAC(SafeSaveMixin, SAC):
         # The replay was emptied, or not loaded with the agent, or somebody has played the environments
         if obs is not None and not (self.replay_buffer.knows_past(obs).all() and self._are_at(obs)):
             self._last_obs = None  # SB3 then resets the environments
+        if self._last_obs is None:
+            for monitor in self._strict_monitors():
+                monitor.needs_reset = True
         self._note_task()
         name = type(self).__name__ if tb_log_name == "SAC" else tb_log_name  # SB3's default would be all algorithms'
         learn = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, name, progress_bar)
@@ -191,7 +194,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
     def _are_at(self, obs: np.ndarray | dict[str, np.ndarray]) -> bool:
         """Tell whether the environments handed out these observations last, and nobody has played them since."""
         assert self.env is not None
-        if not isinstance(obs, dict) or not self.env.has_attr("handed_out"):
+        if not isinstance(obs, dict) or not _has_attr(self.env, "handed_out"):
             return self._left_at is not None and self._left_at == self._steps_counted()
         last = self.env.get_attr("handed_out")
         return all(np.array_equal(obs[key][i], part) for i, parts in enumerate(last) for key, part in parts.items())
@@ -235,6 +238,17 @@ class DelayedSAC(SafeSaveMixin, SAC):
         if self._last_obs is not None:  # else a callback has played at this very step, whose observation is gone
             super()._store_transition(*args, **kwargs)
 
+    def _monitors(self) -> list[Monitor | VecMonitor]:
+        """Return those of SB3's that are in this process."""
+        assert self.env is not None
+        envs = getattr(self.env.unwrapped, "envs", [])
+        found = [unwrap_vec_wrapper(self.env, VecMonitor), *(unwrap_wrapper(env, Monitor) for env in envs)]
+        return [monitor for monitor in found if isinstance(monitor, (Monitor, VecMonitor))]
+
+    def _strict_monitors(self) -> list[Monitor]:
+        """Return those that refuse a reset amid an episode, unless they are told that it is due."""
+        return [x for x in self._monitors() if isinstance(x, Monitor) and not x.allow_early_resets]
+
     @contextmanager
     def borrowed_env(self) -> Iterator[VecEnv]:
         """Hand out the training environment for steps that teach nothing.
@@ -243,11 +257,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
         these steps, except those of environments in other processes. Learning, where it goes on, starts a new episode.
         """
         assert self.env is not None
-        envs = getattr(self.env.unwrapped, "envs", [])
-        found = [unwrap_vec_wrapper(self.env, VecMonitor), *(unwrap_wrapper(env, Monitor) for env in envs)]
-        monitors = [monitor for monitor in found if isinstance(monitor, (Monitor, VecMonitor))]
+        monitors, strict = self._monitors(), self._strict_monitors()
         writers = [monitor.results_writer for monitor in monitors]
-        strict = [monitor for monitor in monitors if isinstance(monitor, Monitor) and not monitor.allow_early_resets]
         normalizer = self._vec_normalize_env
         before = None if normalizer is None else (normalizer.training, normalizer.norm_reward)
         if normalizer is not None:
@@ -354,9 +365,9 @@ class DelayedSAC(SafeSaveMixin, SAC):
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """Write the replay buffer to a file without pickle.
 
-        :param path: of the file, or a binary file object
+        :param path: of the file, to which ``.pkl`` is added where it has no suffix, or a binary file object
         """
-        save_tree(path, self.replay_buffer.state_dict())  # type: ignore[arg-type]
+        save_tree(with_suffix(path, ".pkl"), self.replay_buffer.state_dict())  # type: ignore[arg-type]
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """Read what ``save_replay_buffer`` wrote into this agent's buffer, running no code from the file.
@@ -380,6 +391,14 @@ def _is_delayed(env: Any) -> bool:
     if isinstance(env, VecEnv):
         return any(_are_wrapped(env, DelayedObservationWrapper))
     return is_wrapped(env, DelayedObservationWrapper)
+
+
+def _has_attr(env: VecEnv, name: str) -> bool:
+    """Tell whether the environments have an attribute: none of those that cannot be asked has."""
+    try:
+        return env.has_attr(name)
+    except NotImplementedError:
+        return False
 
 
 def _are_wrapped(env: VecEnv, wrapper: type[gym.Wrapper[Any, Any, Any, Any]]) -> list[bool]:

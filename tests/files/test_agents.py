@@ -11,6 +11,7 @@ import pytest
 import torch as th
 from saving import OwnPolicy, forge, make_policy, make_sac, same
 from small_task import delayed
+from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.utils import ConstantSchedule, LinearSchedule
@@ -127,14 +128,35 @@ def test_arguments_of_load(saved, trained, capsys):
         DelayedSAC.load(saved, gama=1, device="cpu")
 
 
-@pytest.mark.parametrize("count", [6e1, np.int64(60), np.float32(60)])
-def test_an_agent_that_learned_a_number_of_any_type_of_steps_can_be_loaded(count, tmp_path):
+@pytest.mark.parametrize(
+    ("count", "steps", "total"),
+    [
+        (6e1, 60, 60),
+        (np.int64(60), 60, 60),
+        (np.float32(60), 60, 60),
+        (0.57 * 1e2, 57, 57),  # 56.99999999999999
+        (float("inf"), 200, 2**63 - 1),  # until a callback ends it
+    ],
+)
+def test_an_agent_that_learned_a_number_of_any_type_of_steps_can_be_loaded(count, steps, total, tmp_path):
     """``learn(1e6)`` is how many write it."""
-    model = make_sac().learn(count)
+    model = make_sac().learn(count, callback=StopTrainingOnMaxEpisodes(1))
     model.save(tmp_path / "agent.zip")
-    loaded = DelayedSAC.load(tmp_path / "agent.zip", device="cpu")
-    assert loaded.num_timesteps == loaded._total_timesteps == 60 and type(loaded._total_timesteps) is int
+    loaded = DelayedSAC.load(tmp_path / "agent.zip", env=model.get_env(), device="cpu")
+    assert loaded.num_timesteps == steps and type(loaded._total_timesteps) is int and loaded._total_timesteps == total
     restore_agent(make_sac(), agent_state(model))
+    assert loaded.learn(20, reset_num_timesteps=False).num_timesteps == steps + 20
+
+
+class Passing(DelayedSAC):
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+
+
+def test_an_algorithm_that_passes_its_arguments_on_is_saved(tmp_path):
+    model = make_sac(cls=Passing, gamma=0.5).learn(20)
+    model.save(tmp_path / "agent.zip")
+    assert same(Passing.load(tmp_path / "agent.zip", device="cpu").get_parameters(), model.get_parameters())
 
 
 def test_set_parameters_from_a_file(saved, trained):

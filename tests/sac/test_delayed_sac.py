@@ -258,3 +258,14 @@ def test_a_replay_is_found_with_sb3_s_suffix_and_without(tmp_path):
     assert other.replay_buffer.size() == 30
     with pytest.raises(FileNotFoundError, match=r"no file '.*nothing' and no '.*nothing\.pkl'"):
         other.load_replay_buffer(tmp_path / "nothing")
+
+
+def test_a_replay_may_have_the_agent_s_name(tmp_path):
+    """SB3's own way, whose suffixes tell them apart."""
+    model = make().learn(30)
+    model.save(tmp_path / "agent")
+    model.save_replay_buffer(tmp_path / "agent")
+    assert {path.name for path in tmp_path.iterdir()} == {"agent.zip", "agent.pkl"}
+    loaded = DelayedSAC.load(tmp_path / "agent", env=delayed(), device="cpu")
+    loaded.load_replay_buffer(tmp_path / "agent")
+    assert loaded.replay_buffer.size() == 30

@@ -46,10 +46,11 @@ def test_a_simulator_that_knows_no_wrappers_is_taken(error, monkeypatch):
     """As those whose environments are computed side by side on a GPU."""
 
     def refuse(*_):
-        raise error("Checking if environment is wrapped is not supported.")
+        raise error("Asking an environment is not supported.")
 
     env = DummyVecEnv([Drift, Drift])
     monkeypatch.setattr(env, "env_is_wrapped", refuse)
+    monkeypatch.setattr(env, "get_attr", refuse)
     model = make(env).learn(20)
     assert model.learn(20, reset_num_timesteps=False).num_timesteps == 40
 

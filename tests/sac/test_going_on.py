@@ -170,6 +170,15 @@ def test_a_task_whose_attributes_have_a_monitors_names_is_none(rewards, monkeypa
     assert_replay_is_what_happened(model, rows)
 
 
+@pytest.mark.parametrize("make_env", [Drift, delayed])
+def test_learning_goes_on_under_monitors_that_refuse_resets(make_env):
+    env = make_vec_env(make_env, 2, monitor_kwargs={"allow_early_resets": False})
+    model = make(env).learn(100, callback=Stop(at=26))
+    assert model.learn(20, reset_num_timesteps=False).num_timesteps == 46
+    with pytest.raises(RuntimeError, match="reset"):
+        env.reset()
+
+
 def test_who_plays_the_environment_during_learning_is_told_what_to_do():
     env = make_vec_env(lambda: delayed(4), n_envs=1)
     with pytest.raises(ValueError, match=r"evaluate_policy.*an environment of its own"):
