@@ -180,8 +180,7 @@ def confidence_interval(
     if not np.all(np.isfinite(found.confidence_interval)):
         method = "percentile bootstrap"
         found = bootstrap((everyone,), n_resamples=0, method="percentile", bootstrap_result=found, **settings)
-    low, high = found.confidence_interval
-    return Interval(value, float(low), float(high), confidence, n, method)
+    return Interval(value, *_holding(value, *found.confidence_interval), confidence, n, method)
 
 
 def stratified_interval(
@@ -208,8 +207,14 @@ def stratified_interval(
     for _ in range(n_seeds):  # one drawn seed at a time, as all together take gigabytes
         drawn = rng.integers(n_seeds, size=(n_resamples, 1))
         means += values[drawn, rng.integers(n_episodes, size=(n_resamples, n_episodes))].mean(1) / n_seeds
-    low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
-    return Interval(float(values.mean()), float(low), float(high), confidence, values.size, "stratified bootstrap")
+    bounds = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
+    value = float(values.mean())
+    return Interval(value, *_holding(value, *bounds), confidence, values.size, "stratified bootstrap")
+
+
+def _holding(value: float, low: float, high: float) -> tuple[float, float]:
+    """Return bounds that hold the value: of equal values, means that are summed in another order miss it by a bit."""
+    return min(float(low), value), max(float(high), value)
 
 
 def _check_confidence(confidence: float) -> None:

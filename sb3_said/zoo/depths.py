@@ -60,7 +60,8 @@ class DepthPlanners:
         return {
             "agent": self._agent,
             "gradient_steps": self.gradient_steps,
-            "newest_fraction": self.model.newest_fraction,
+            # As of a replay that holds the logs, which is not there where nothing is left to train
+            "newest_fraction": 1.0 if self.dataset else self.model.newest_fraction,
             "terminal_penalty": self.model.planner_terminal_penalty,
             "training_seed": self.model.seed or 0,
             "trained_steps": self.model.num_timesteps,

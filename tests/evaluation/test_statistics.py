@@ -127,6 +127,14 @@ def test_interval_of_constant_and_single_values() -> None:
     assert one.value == 3.0 and np.isnan(one.low) and np.isnan(one.high)
 
 
+@settings(deadline=None, max_examples=30)
+@given(st.floats(-1e4, 1e4), st.integers(2, 50), st.integers(0, 99))
+def test_an_interval_of_equal_values_holds_their_mean(value: float, n: int, seed: int) -> None:
+    """Whose last bits depend on the order of the sum."""
+    for interval in (confidence_interval([value] * n, seed=seed), stratified_interval([[value] * n] * 3, seed=seed)):
+        assert interval.low <= interval.value <= interval.high
+
+
 @pytest.mark.filterwarnings("error")
 def test_interval_where_no_single_value_matters() -> None:
     found = confidence_interval([1.0] * 7 + [5.0] * 4, np.median)
