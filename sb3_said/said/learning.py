@@ -172,7 +172,8 @@ class PlannerLearner(OfflineAlgorithm):
         """Train the planner, and V(s) beside it, on logs of a task without delay (paper, Algorithm 2).
 
         No environment is stepped and no expert is trained; the planner serves every delay 0..D. Callbacks are called
-        after each update, and meet a planner that is at most 100 updates old. ``num_timesteps`` counts updates.
+        after each update, and meet a planner that is at most 100 updates old. ``num_timesteps`` counts updates. From
+        the first on the planner answers, by plans.
 
         :param dataset: whatever :func:`~sb3_said.offline.load_dataset` reads; None for what ``take_dataset`` took
         :param gradient_steps: ``planner_gradient_steps`` by default
@@ -186,13 +187,17 @@ class PlannerLearner(OfflineAlgorithm):
         :param save_interval: updates between two checkpoints; by default ten minutes, and longer where they are large
         :param should_stop: as of :meth:`train_planner`
         :raises KeyboardInterrupt: when ``should_stop`` has ended the training
-        :raises ValueError: as ``load_dataset`` and :meth:`train_planner` do
+        :raises ValueError: as ``load_dataset`` and :meth:`train_planner` do, and for ``decided_by="actor"`` where no
+            expert has learned
         """
         total = self.planner_gradient_steps if gradient_steps is None else whole("gradient_steps", gradient_steps)
         check_intervals(log_interval=log_interval, eval_interval=eval_interval, save_interval=save_interval)
         with self._as_before_if_it_fails():
             ways_of(self.planner_ways, self.policy.planner.config.to_dict(), "iql")  # refuses what V(s) cannot score
             watcher = self._begin_offline(dataset, total, callback, tb_log_name, True, progress_bar)
+            self._check_decider(self.policy.planner.config.decided_by)
+            # An actor of the steps before, as a trial may have chosen, would leave all that is learned here aside
+            self.policy.planner.config = replace(self.policy.planner.config, decided_by="plan")
             self.value = "iql"
             self.policy.set_value("iql")
             trainer, values = self.make_planner_trainer(total), self._make_value_trainer()
@@ -210,6 +215,7 @@ class PlannerLearner(OfflineAlgorithm):
             self.num_timesteps = n_updates
             if is_new or n_updates % HAND_OVER_INTERVAL == 0:  # else an expert that learns nothing would answer
                 training.hand_over()
+                self.policy.set_answer("planner")
                 is_new = False
             return self._goes_on(watcher)
 
@@ -225,6 +231,11 @@ class PlannerLearner(OfflineAlgorithm):
     def has_expert(self) -> bool:
         """Whether actor and critics have learned, here or where ``set_parameters`` has them from."""
         return self._n_updates > 0 or len(self.actor.optimizer.state) > 0
+
+    def _check_decider(self, decided_by: str | None) -> None:
+        """:raises ValueError: for the actor, where no expert has learned"""
+        if decided_by == "actor" and not self.has_expert:
+            raise ValueError("decided_by='actor' lets the expert's actor decide, which this agent has not trained.")
 
     @property
     def newest_fraction(self) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterable
 from dataclasses import asdict, fields, replace
@@ -103,7 +104,10 @@ class SAID(PlannerLearner, StableSAC):
             None if planner_train_freq is None else whole("planner_train_freq", planner_train_freq)
         )
         self.planner_newest_fraction = planner_newest_fraction
-        self.planner_terminal_penalty = planner_terminal_penalty
+        penalty = planner_terminal_penalty
+        if penalty is not None and not math.isfinite(penalty):
+            raise ValueError(f"planner_terminal_penalty is a reward, got {penalty}; None keeps the task's own.")
+        self.planner_terminal_penalty = None if penalty is None else float(penalty)
         self.planner_trial_episodes = whole("planner_trial_episodes", planner_trial_episodes, least=0)
         self.planner_ways = ways_of(planner_ways, self._given_planner_kwargs, value)
         self.value = value
@@ -152,7 +156,7 @@ class SAID(PlannerLearner, StableSAC):
     def _check_file(self, saved: dict[str, Any]) -> None:
         """Refuse a trained planner of other settings than this agent's, of which its weights mean something else."""
         super()._check_file(saved)
-        if saved["parameters"]["policy"]["planner_updates"] > 0:
+        if saved["parameters"]["policy"].get("planner_updates", 0) > 0:
             self._check_weights(from_data(saved["arguments"].get("planner_kwargs", {})), WEIGHT_SETTINGS)
 
     def _check_weights(self, given: dict[str, Any], names: Iterable[str]) -> None:
@@ -260,8 +264,7 @@ class SAID(PlannerLearner, StableSAC):
                 "give it as planner_kwargs of a new agent."
             )
         check_scored(settings, self.policy.values is not None)
-        if settings.get("decided_by") == "actor" and not self.has_expert:
-            raise ValueError("decided_by='actor' lets the expert's actor decide, which this agent has not trained.")
+        self._check_decider(settings.get("decided_by"))
         self.policy.planner.config = replace(self.policy.planner.config, **settings)
 
     def set_answer(self, who: Answer, expert_up_to: int | None = None, expert_from: int | None = None) -> None:

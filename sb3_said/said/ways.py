@@ -72,8 +72,11 @@ def ways_of(
 
 
 def _on_the_first(ways: dict[str, dict[str, Any]], own: PlannerConfig) -> dict[str, dict[str, Any]]:
-    """Let ways be of the agent's first planner, but for those that say otherwise, also once it has the second's."""
-    return {name: {"mask": own.mask, "present": own.present, **way} for name, way in ways.items()}
+    """Let ways be of the agent's first planner, but for those that say otherwise, also once it has the second's.
+
+    Its present stands where the rest of a way does not contradict it.
+    """
+    return {name: {"mask": own.mask, **way, "present": in_way(own, way).present} for name, way in ways.items()}
 
 
 def in_way(own: PlannerConfig, settings: dict[str, Any]) -> PlannerConfig:

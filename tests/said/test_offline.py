@@ -196,6 +196,32 @@ def test_an_expert_that_has_learned_nothing_is_not_let_answer():
     assert model.policy.who_answers == "planner"
 
 
+@pytest.mark.parametrize("before", ["expert", "student", "actor"])
+def test_the_planner_of_the_logs_answers_whoever_did_before(before):
+    """And callbacks meet it, as EvalCallback that keeps the best agent."""
+    model = make().learn(60)
+    if before == "student":
+        model.distill(n_labels=20, own_steps=5, rounds=1, gradient_steps=2)
+    if before == "actor":
+        model.set_planner(decided_by="actor")
+    else:
+        model.set_answer(before)
+    met = []
+
+    def note(*_):
+        met.append((model.policy.who_answers, model.policy.planner.config.decided_by))
+        return True
+
+    learn(model, callback=note)
+    note()
+    assert {*met} == {("planner", "plan")} and len(met) == 9
+
+
+def test_an_actor_that_has_learned_nothing_is_not_let_decide():
+    with pytest.raises(ValueError, match="the expert's actor decide, which this agent has not trained"):
+        learn(make(planner_kwargs={"decided_by": "actor"}))
+
+
 @pytest.mark.parametrize("is_loaded", [False, True])
 def test_steps_that_follow_updates_are_counted_from_the_first(is_loaded, tmp_path):
     """Else states would be scaled by the first one, and no step be taken at random."""

@@ -167,6 +167,7 @@ def test_settings_that_cannot_be_changed_are_refused(saved, given, message):
         ),
         ({"planner_train_freq": 0}, "planner_train_freq must be a whole number, at least 1, got 0"),
         ({"planner_trial_episodes": -1}, "planner_trial_episodes must be a whole number, at least 0, got -1"),
+        ({"planner_terminal_penalty": float("nan")}, "planner_terminal_penalty is a reward, got nan"),
         ({"planner_newest_fraction": 0.0}, r"in \(0, 1\], got 0"),
         ({"planner_newest_fraction": 1.5}, r"in \(0, 1\], got 1.5"),
         ({"delay_reconciled_critic": False}, "must read true states"),
@@ -389,6 +390,17 @@ def test_a_trained_planner_is_not_taken_over_where_its_weights_mean_something_el
     assert loaded.planner_kwargs[name] == other[name]
 
 
+def test_an_expert_from_a_file_of_its_own_class_is_one(tmp_path):
+    expert, model = make(cls=StableSAC).learn(40), make(seed=4)
+    expert.save(tmp_path / "expert.zip")
+    with pytest.raises(SavedFileError, match=r"it lacks \['planner"):
+        model.set_parameters(tmp_path / "expert.zip")
+    assert not model.has_expert
+    model.set_parameters(tmp_path / "expert.zip", exact_match=False)
+    assert model.has_expert
+    np.testing.assert_allclose(answer(model, observe()), answer(expert, observe()), rtol=1e-4)  # rows one by one
+
+
 def test_an_expert_from_a_file_without_optimizers_is_one(trained, tmp_path):
     for agent, has_expert in ((trained, True), (make(), False)):
         agent.save(tmp_path / "compact.zip", compact=True)
@@ -526,7 +538,7 @@ def test_the_newest_part_of_the_buffer():
     assert trainer._settings["n_windows"] == 100 and trainer.older is None
 
 
-@pytest.mark.parametrize("penalty", [-100.0, None])
+@pytest.mark.parametrize("penalty", [-100.0, np.float32(-100), None])
 def test_what_an_end_is_worth(penalty):
     kwargs = {"planner_terminal_penalty": penalty, "planner_kwargs": {"value_scale": "range"}}
     model = make(delayed(truncates=False), **kwargs).learn(60)

@@ -49,6 +49,22 @@ def test_a_way_that_the_agent_cannot_have_is_refused_before_anything_is_learned(
         make(planner_ways={"x": way}, **kwargs)
 
 
+@pytest.mark.parametrize(
+    ("kwargs", "ways", "delay"),
+    [
+        ({"present": "inpainted"}, {"a": {"decided_by": "actor"}, "b": {"mask": "own"}}, (0, 2)),
+        ({"mask": "own", "present": "inpainted"}, {"b": {"mask": "none"}}, (0, 2)),
+        ({}, {"b": {"mask": "fixed"}}, 2),
+    ],
+)
+def test_ways_of_several_planners_that_are_taken_are_trained_tried_and_loaded(kwargs, ways, delay, tmp_path):
+    """Also where one contradicts the planner's own present."""
+    model = make(pendulum(delay=delay), planner_kwargs=kwargs, planner_ways=ways, planner_trial_episodes=1).learn(60)
+    model.save(tmp_path / "agent.zip")
+    assert SAID.load(tmp_path / "agent.zip", device="cpu").planner_ways == model.planner_ways
+    assert {*model.planner_ways} == {*ways} and {*model.planner_ways["b"]} == {"mask", "present"}
+
+
 @pytest.mark.parametrize("settings", [{"present": "inpainted"}, {"decided_by": "actor"}, {"temperature": 0.0}])
 def test_a_decision_of_one_s_own_is_kept_in_a_file_and_tried_against_all_ways(settings, tmp_path):
     """Some ways say otherwise of who decides, and where."""
