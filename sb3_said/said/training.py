@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger
 from tqdm.auto import tqdm
 
 from sb3_said.files.archive import load_tree, readable, save_tree
@@ -135,12 +134,16 @@ class PlannerTraining:
                 self.model.policy.values.load_state_dict(self.value_trainer.values.state_dict())
 
     def log(self, values: Mapping[str, float | str]) -> None:
-        """Write a row with a logger of its own, to the same places: the user's keeps what it holds for its next row."""
-        log = Logger(self.model.logger.dir, self.model.logger.output_formats)
-        log.set_level(self.model.logger.level)
+        """Write a row to the agent's logger, which keeps what it holds for its next one."""
+        logger = self.model.logger
+        held = {name: getattr(logger, name).copy() for name in ("name_to_value", "name_to_count", "name_to_excluded")}
+        for name in held:
+            getattr(logger, name).clear()
         for key, value in values.items():
-            log.record(key, value)
-        log.dump(self.row(self.trainer.n_updates))
+            logger.record(key, value)
+        logger.dump(self.row(self.trainer.n_updates))
+        for name, pending in held.items():
+            getattr(logger, name).update(pending)
 
     def _is_due(self, clock: CheckpointClock, n_updates: int) -> bool:
         return clock.is_due() if self.save_interval is None else n_updates % self.save_interval == 0

@@ -145,7 +145,8 @@ def _play(
             obs, rewards, dones, infos = env.step(model.predict(obs, deterministic=True)[0])
             sums, n_steps = sums + rewards, n_steps + env.num_envs
             for i in np.flatnonzero(is_played & (dones | (len(ages) == longest))):
-                returns[first + i] = infos[i].get("episode", {}).get("r", sums[i])  # the task's, where a Monitor saw it
+                seen = infos[i].get("episode") or {}  # a Monitor sees the task's own rewards
+                returns[first + i] = seen.get("r", sums[i])
                 settled_ages[first + i] = _settled_age(np.stack(ages)[:, i], model.policy.max_delay)
                 is_played[i] = False
                 bar.update()

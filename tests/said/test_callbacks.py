@@ -235,6 +235,28 @@ def test_rows_of_the_planner_are_its_own_and_in_order():
     assert logger.name_to_value["mean"] == 4.0
 
 
+class Forwarding(Logger):
+    """As a logger that puts those of several learners into one."""
+
+    def __init__(self, to):
+        super().__init__(None, [])
+        self.to = to
+
+    def record(self, key, value, exclude=None):
+        self.to.record(key, value, exclude)
+
+    def dump(self, step=0):
+        self.to.dump(step)
+
+
+def test_rows_of_the_planner_go_where_those_of_the_expert_do():
+    memory = Memory()
+    model = make()
+    model.set_logger(Forwarding(Logger(None, [memory])))
+    model.learn(100, log_interval=1)
+    assert any("planner/loss" in row for row in memory.rows) and any("time/episodes" in row for row in memory.rows)
+
+
 @pytest.mark.parametrize(("how", "is_told"), [({}, True), ({"progress_bar": True}, False), ({"verbose": 1}, False)])
 def test_a_training_that_shows_nothing_says_that_it_begins(how, is_told, capsys):
     verbose = how.pop("verbose", 0)

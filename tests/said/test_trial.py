@@ -155,12 +155,16 @@ def test_ages_that_change_within_an_episode_tell_nothing_of_it():
 class Lively(Drift):
     """Ends by an action near the bounds, which chance takes and no answer does."""
 
+    info: ClassVar[dict] = {}
+
     def step(self, action):
         state, reward, *_ = super().step(action)
-        return state, reward, bool(abs(action[0]) > 1.9), False, {}
+        return state, reward, bool(abs(action[0]) > 1.9), False, dict(self.info)
 
 
-def test_an_episode_that_a_good_answer_never_ends_is_cut(monkeypatch):
+@pytest.mark.parametrize("info", [{}, {"episode": None}])  # the second is of Isaac Lab's VecEnv
+def test_an_episode_that_a_good_answer_never_ends_is_cut(info, monkeypatch):
+    monkeypatch.setattr(Lively, "info", info)
     model = make(env=DelayedObservationWrapper(Lively(), 2), learning_starts=60, gradient_steps=1).learn(70)
     longest = model.replay_buffer.steps.max() + 1
     monkeypatch.setattr(model, "predict", lambda obs, **_: (np.zeros((1, 1), np.float32), None))
