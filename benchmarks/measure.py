@@ -28,7 +28,7 @@ DTYPES = {"float32": th.float32, "bfloat16": th.bfloat16}
 def parser(doc: str | None) -> argparse.ArgumentParser:
     """Return a parser with the options of every benchmark."""
     made = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
-    made.add_argument("--num-threads", type=int, help="torch threads; all cores by default")
+    made.add_argument("--num-threads", type=int, help="torch threads (default: %(default)s; None: all cores)")
     made.add_argument("--rounds", type=int, help="turns of each variant; more make narrower intervals")
     made.add_argument("--device", default="cpu", help="torch device, such as cuda")
     made.add_argument("--json", type=Path, metavar="FILE", help="also write settings, machine and figures to FILE")

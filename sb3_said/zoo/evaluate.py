@@ -35,11 +35,12 @@ examples:
   # the same in real time: the task does not wait for answers, so their time on this machine is delay
   sb3-said evaluate logs/said/Hopper-v5-delay4-seed1_1 --realtime --period 0.02
 
-Episode i starts from reset seed --seed + i, so two agents meet the same starts; --n-envs changes only the speed. A
-return is the undiscounted sum of the task's own rewards, and a score is D4RL's, 0 for a random policy and 100 for an
-expert, where D4RL has both. Decisions are timed after the episodes, one at a time, from NumPy observation to NumPy
-action. The last agent of a run is played, and where an earlier one did best in training, that "best" one too, or alone
-where the run was killed: it was chosen on other episodes than these.
+Episode i starts from reset seed --seed + i, so two agents meet the same starts; --n-envs changes the speed, the
+rounding of agents other than SAID, and with --stochastic what is drawn. A return is the undiscounted sum of the
+task's own rewards, and a score is D4RL's, 0 for a random policy and 100 for an expert, where D4RL has both. Decisions
+are timed after the episodes, one at a time, from NumPy observation to NumPy action. The last agent of a run is played,
+and where an earlier one did best in training, that "best" one too, or alone where the run was killed: it was chosen on
+other episodes than these.
 
 With --realtime every answer is also made to wait: it takes effect at the first control step after the time that it
 took. The row "in real time" plans for that step. The row "latency ignored" plans for the step at which it was asked,

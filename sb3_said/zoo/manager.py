@@ -122,7 +122,7 @@ class DelayedExperimentManager(ExperimentManager):
         if issubclass(ALGORITHMS[algo][0], OfflineAlgorithm) and self.optimize_hyperparameters:
             raise ValueError(
                 "-optimize scores an expert in its environment, and would train a planner in each trial for nothing. "
-                "Search the expert's settings with --algo sadr -optimize, and the planner's with sb3-said tune on a "
+                "Search the expert's settings with --algo stable -optimize, and the planner's with sb3-said tune on a "
                 "trained run."
             )
         for option, number in (("n-eval-envs", self.n_eval_envs), ("eval-episodes", self.n_eval_episodes)):

@@ -36,7 +36,7 @@ examples:
 
 Runs go to LOG_FOLDER/ALGO/ENV-delayN-seedS_K (-f sets LOG_FOLDER); sb3-said evaluate and sb3-said enjoy take that
 folder. Ctrl-C, SIGTERM and SIGHUP write a checkpoint before they end the training; --resume goes on from there.
-Below: the options of rl_zoo3, all of which work here.
+Below: the options of rl_zoo3. -optimize is for agents without a planner, --save-replay-buffer not for logs.
 """
 
 

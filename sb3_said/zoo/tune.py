@@ -43,7 +43,7 @@ from sb3_said.zoo.search import (
 RESULTS_NAME = "results.json"
 EPILOG = f"""\
 examples:
-  # the paper's grid: three planners are trained, each is tried at six temperatures
+  # the default: three planners are trained, each is tried at six temperatures
   sb3-said tune logs/said/Hopper-v5-delay4-seed1_1
 
   # two workers; they may run on machines that share the folder

@@ -338,7 +338,7 @@ def test_the_expert_can_learn_under_another_delay(tmp_path: Path, monkeypatch: p
         ("--algo sadr --delay 4 --expert-delay 0", "--expert-delay needs --algo said"),
         ("--algo said --expert-delay 0", "--expert-delay needs --algo said"),
         ("--resume {}", "holds no run"),
-        ("--algo said --delay 4 -optimize", "with --algo sadr -optimize, and the planner's with sb3-said tune"),
+        ("--algo said --delay 4 -optimize", "with --algo stable -optimize, and the planner's with sb3-said tune"),
         ("--env Pendulun-v1", "you maybe meant Pendulum-v1?"),
         ("-i nowhere.zip", "must be a valid path to a .zip file"),
         ("--gym-packages not_there", "No module named 'not_there'"),

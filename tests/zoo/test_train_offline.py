@@ -259,7 +259,7 @@ def test_tune_trains_depths_on_the_same_logs(finished: tuple[str, Path], monkeyp
         ("--algo bc --dataset nowhere.npz", "nowhere.npz, which is not there"),
         ("--algo said --dataset {log} -params planner_gradient_steps:3", "whose steps -n sets"),
         ("--algo bc --dataset {log} --save-replay-buffer", "--save-replay-buffer has no place"),
-        ("--algo bc --dataset {log} -optimize", "--algo sadr -optimize"),
+        ("--algo bc --dataset {log} -optimize", "--algo stable -optimize"),
     ],
 )
 def test_says_what_is_wrong(
