@@ -182,7 +182,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
         # The replay was emptied, or not loaded with the agent, or somebody has played the environments
         if obs is not None and not (self.replay_buffer.knows_past(obs).all() and self._are_at(obs)):
             self._last_obs = None  # SB3 then resets the environments
-        if self._last_obs is None:
+        if self._last_obs is None and self.env is not None:
             for monitor in self._strict_monitors():
                 monitor.needs_reset = True
         self._note_task()

@@ -170,6 +170,12 @@ def test_a_task_whose_attributes_have_a_monitors_names_is_none(rewards, monkeypa
     assert_replay_is_what_happened(model, rows)
 
 
+def test_a_loaded_agent_without_an_environment_is_told_so(tmp_path):
+    make().save(tmp_path / "agent.zip")
+    with pytest.raises(AssertionError, match="set the environment"):  # SB3's
+        DelayedSAC.load(tmp_path / "agent.zip", device="cpu").learn(10)
+
+
 @pytest.mark.parametrize("make_env", [Drift, delayed])
 def test_learning_goes_on_under_monitors_that_refuse_resets(make_env):
     env = make_vec_env(make_env, 2, monitor_kwargs={"allow_early_resets": False})
