@@ -83,16 +83,21 @@ class Results:
         if found != self.settings:
             raise ValueError(f"{path} holds {found}, but {settings} is to be played: give another --json.")
 
-    def ask(self, cells: list[Cell]) -> None:
-        """Put these cells first, and fill in known results; drop cells of agents whose file has changed."""
+    def ask(self, cells: list[Cell]) -> list[Cell]:
+        """Put these cells first, and fill in known results; drop cells of agents whose file has changed.
+
+        :return: those dropped
+        """
         known = {cell.key: cell for cell in self.cells if cell.result is not None}
         for cell in cells:
             if cell.obstacle is None and cell.result is None and (old := known.get(cell.key)) is not None:
                 cell.origin, cell.result = old.origin, old.result
         asked, agents = {cell.key for cell in cells}, {cell.lineage: cell.sha256 for cell in cells}
         others = [cell for cell in self.cells if cell.key not in asked]
-        self.cells = cells + [x for x in others if agents.get(x.lineage, x.sha256) == x.sha256]
+        has_changed = [agents.get(cell.lineage, cell.sha256) != cell.sha256 for cell in others]
+        self.cells = cells + [cell for cell, changed in zip(others, has_changed, strict=True) if not changed]
         self._asked = cells
+        return [cell for cell, changed in zip(others, has_changed, strict=True) if changed]
 
     def add(self, cell: Cell, result: dict[str, Any], origin: dict[str, Any]) -> None:
         """Give one of the cells asked for its result, and write the file.

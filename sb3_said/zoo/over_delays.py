@@ -10,6 +10,7 @@ import os
 import re
 import threading
 import warnings
+from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
@@ -185,7 +186,8 @@ def play_missing(args: argparse.Namespace, delays: list[int | str]) -> list[Cell
             else f"There is nothing to play: no run is of the delays {', '.join(map(str, delays))}."
         )
     choose_rows(args.rows, cells)
-    results.ask(cells)
+    for (file, label), n in Counter(cell.lineage for cell in results.ask(cells)).items():
+        print(f"{n} results of {label} are dropped: {file} has changed since.")
     todo = [cell for cell in cells if cell.result is None and cell.obstacle is None]
     print_settings(settings)
     for cell in cells:

@@ -231,14 +231,15 @@ def test_cells_of_another_version_are_told_in_one_line(tmp_path: Path, capsys) -
     assert "is no file of over-delays" in capsys.readouterr().err
 
 
-def test_a_changed_agent_is_played_again(said: Path, tmp_path: Path, monkeypatch) -> None:
+def test_a_changed_agent_is_played_again(said: Path, tmp_path: Path, monkeypatch, capsys) -> None:
     file, folder = tmp_path / "out.json", tmp_path / "d1"
     write_run(folder, DelayedSAC, 1)
     old = play(file, [f"a={said}", f"b={folder}"], ["0", "1"])
     write_run(folder, DelayedSAC, 1, seed=5)
     played = count_plays(monkeypatch)
+    assert "dropped" not in capsys.readouterr().out
     new = play(file, [f"b={folder}"], ["1"])
-    assert played == [("b", 1)]
+    assert played == [("b", 1)] and "2 results of b are dropped: " in capsys.readouterr().out
     # What the agent did before it changed is gone, also where it was not asked for now.
     assert sorted(by_cell(new), key=str) == sorted(
         [(f"a {w}", d) for w in ("expert", "planner") for d in (0, 1)] + [("b", 1)]
