@@ -242,10 +242,16 @@ class SAID(PlannerLearner, StableSAC):
         """Build an agent from a file, as :meth:`DelayedSAC.load` does.
 
         As in the constructor, ``planner_kwargs`` that say how to decide leave a later ``learn`` no ways to try.
+
+        :raises ValueError: as it does, and for ``decided_by="actor"`` where a planner has learned and no expert
         """
-        if set(SAMPLING_SETTINGS) & set(kwargs.get("planner_kwargs") or {}):
+        given = kwargs.get("planner_kwargs") or {}
+        if set(SAMPLING_SETTINGS) & set(given):
             kwargs = {"planner_ways": {}, **kwargs}
-        return super().load(path, *args, **kwargs)
+        model = super().load(path, *args, **kwargs)
+        if model.policy.planner_is_trained:
+            model._check_decider(given.get("decided_by"))
+        return model
 
     def set_planner(self, **settings: Any) -> None:
         """Change how the planner answers, also after training or loading; ``save`` keeps the change.

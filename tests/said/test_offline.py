@@ -217,9 +217,16 @@ def test_the_planner_of_the_logs_answers_whoever_did_before(before):
     assert {*met} == {("planner", "plan")} and len(met) == 9
 
 
-def test_an_actor_that_has_learned_nothing_is_not_let_decide():
-    with pytest.raises(ValueError, match="the expert's actor decide, which this agent has not trained"):
+def test_an_actor_that_has_learned_nothing_is_not_let_decide(learned, tmp_path):
+    message = "the expert's actor decide, which this agent has not trained"
+    with pytest.raises(ValueError, match=message):
         learn(make(planner_kwargs={"decided_by": "actor"}))
+    learned.save(tmp_path / "agent.zip")
+    with pytest.raises(ValueError, match=message):
+        SAID.load(tmp_path / "agent.zip", device="cpu", planner_kwargs={"decided_by": "actor"})
+    make().save(tmp_path / "new.zip")  # whose expert may still learn
+    loaded = SAID.load(tmp_path / "new.zip", env=delayed(), device="cpu", planner_kwargs={"decided_by": "actor"})
+    assert loaded.learn(60).policy.planner.config.decided_by == "actor"
 
 
 @pytest.mark.parametrize("is_loaded", [False, True])
