@@ -399,8 +399,9 @@ def _take_parameters(model: SafeSaveMixin, saved: dict[str, Any], exact: bool = 
 
 def with_suffix(path: PathOrFile, suffix: str) -> PathOrFile:
     """Add a suffix to the path of a new file that has none, as SB3 does."""
-    has_none = isinstance(path, (str, os.PathLike)) and pathlib.Path(path).suffix == ""
-    return f"{os.fspath(path)}{suffix}" if has_none else path  # type: ignore[arg-type]
+    if isinstance(path, (str, os.PathLike)) and pathlib.Path(path).suffix == "":
+        return f"{os.fspath(path)}{suffix}"
+    return path
 
 
 def existing(path: PathOrFile, suffix: str = ".zip") -> PathOrFile:

@@ -143,8 +143,8 @@ def space_from_data(node: Any) -> spaces.Space[Any]:
 def replaced(settings: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
     """Return the settings in whose place others are given; of those that have names themselves, these alone."""
     others = {}
-    for name in (x for x in given if x in settings):
-        before, now = settings[name], given[name]
+    for name, now in given.items():
+        before = settings.get(name, now)
         if isinstance(before, dict) and isinstance(now, dict):
             if entries := replaced(before, now):
                 others[name] = entries

@@ -367,7 +367,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
 
         :param path: of the file, to which ``.pkl`` is added where it has no suffix, or a binary file object
         """
-        save_tree(with_suffix(path, ".pkl"), self.replay_buffer.state_dict())  # type: ignore[arg-type]
+        save_tree(with_suffix(path, ".pkl"), self.replay_buffer.state_dict())  # type: ignore[arg-type]  # as in loading
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """Read what ``save_replay_buffer`` wrote into this agent's buffer, running no code from the file.
@@ -397,7 +397,7 @@ def _has_attr(env: VecEnv, name: str) -> bool:
     """Tell whether the environments have an attribute: none of those that cannot be asked has."""
     try:
         return env.has_attr(name)
-    except NotImplementedError:
+    except NotImplementedError:  # of a simulator; SB3 takes an AttributeError for a no by itself
         return False
 
 

@@ -136,14 +136,15 @@ class PlannerTraining:
     def log(self, values: Mapping[str, float | str]) -> None:
         """Write a row to the agent's logger, which keeps what it holds for its next one."""
         logger = self.model.logger
-        held = {name: getattr(logger, name).copy() for name in ("name_to_value", "name_to_count", "name_to_excluded")}
-        for name in held:
-            getattr(logger, name).clear()
+        pending = [(x, x.copy()) for x in (logger.name_to_value, logger.name_to_count, logger.name_to_excluded)]
+        for entries, _ in pending:
+            entries.clear()
         for key, value in values.items():
             logger.record(key, value)
         logger.dump(self.row(self.trainer.n_updates))
-        for name, pending in held.items():
-            getattr(logger, name).update(pending)
+        for entries, before in pending:
+            entries.clear()  # a logger that is disabled has not written them
+            entries.update(before)
 
     def _is_due(self, clock: CheckpointClock, n_updates: int) -> bool:
         return clock.is_due() if self.save_interval is None else n_updates % self.save_interval == 0

@@ -94,10 +94,13 @@ class Results:
                 cell.origin, cell.result = old.origin, old.result
         asked, agents = {cell.key for cell in cells}, {cell.lineage: cell.sha256 for cell in cells}
         others = [cell for cell in self.cells if cell.key not in asked]
-        has_changed = [agents.get(cell.lineage, cell.sha256) != cell.sha256 for cell in others]
-        self.cells = cells + [cell for cell, changed in zip(others, has_changed, strict=True) if not changed]
+
+        def has_changed(cell: Cell) -> bool:
+            return agents.get(cell.lineage, cell.sha256) != cell.sha256
+
+        self.cells = cells + [cell for cell in others if not has_changed(cell)]
         self._asked = cells
-        return [cell for cell, changed in zip(others, has_changed, strict=True) if changed]
+        return [cell for cell in others if has_changed(cell)]
 
     def add(self, cell: Cell, result: dict[str, Any], origin: dict[str, Any]) -> None:
         """Give one of the cells asked for its result, and write the file.

@@ -10,7 +10,7 @@ import pytest
 import torch as th
 from kill import Kill, Killed
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
-from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.logger import DISABLED, KVWriter, Logger
 
 from sb3_said import SAID, DelayedObservationWrapper, PlannerTrainingCallback
 from sb3_said.files import checkpoint
@@ -233,6 +233,10 @@ def test_rows_of_the_planner_are_its_own_and_in_order():
     assert logger.name_to_value["mine"] == 1.0 and "mine" not in memory.rows[-1]
     logger.record_mean("mean", 5.0)
     assert logger.name_to_value["mean"] == 4.0
+    held = dict(logger.name_to_value)
+    logger.set_level(DISABLED)  # which writes nothing, and forgets nothing by itself
+    model.train_planner()
+    assert dict(logger.name_to_value) == held
 
 
 class Forwarding(Logger):
