@@ -26,7 +26,7 @@ YARDSTICK_LEARNING_RATE = 1e-3
 N_NORMALIZER_WINDOWS = 10_000  # enough for a standard deviation to a percent
 N_PRIOR_WINDOWS = 1_000  # each is guessed at every age
 # Of the plain networks of a first guess, before the planner's: at most so many, so many for each of the planner's, and
-# so many passes over the data: a clone of few rows knows them by heart otherwise (results/guess_passes.txt)
+# so many passes over the data: a clone of few rows knows them by heart otherwise (results/make_train.md)
 GUESS_UPDATES, GUESS_UPDATES_EACH, GUESS_PASSES = 20_000, 5, 50
 
 
