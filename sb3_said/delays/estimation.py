@@ -107,8 +107,8 @@ def _rows(
 
     Actions before the episode are the mean action.
 
-    :return: (o_t, o_t - o_{t-1}, 1), (N, features); o_{t+1} - o_t, (N, obs_dim); and a_t, ..., a_{t-max_delay},
-        (max_delay + 1, N, act_dim)
+    :return: (o_t, the change that brought o_t, 1), (N, features); o_{t+1} - o_t, (N, obs_dim); and a_t, ...,
+        a_{t-max_delay}, (max_delay + 1, N, act_dim)
     :raises ValueError: for observations or actions that never change
     """
     all_sent = np.concatenate(actions)
@@ -122,8 +122,9 @@ def _rows(
         raise ValueError("The observations never change: none arrived, or the log is of another system.")
     before, change, lagged = [], [], []
     for o, step, sent in zip(observations, steps, actions, strict=True):
-        t = 1 + np.flatnonzero(np.any(step[1:] != 0, axis=1))
-        before.append(np.hstack([o[t], step[t - 1]]))
+        arrived = np.flatnonzero(np.any(step != 0, axis=1))  # steps whose next row is a new observation
+        t = arrived[1:]
+        before.append(np.hstack([o[t], step[arrived[:-1]]]))  # with the newest change that was seen
         change.append(step[t])
         a = np.concatenate([np.zeros((max_delay, sent.shape[1])), sent - mean])
         lagged.append(a[max_delay + t - np.arange(max_delay + 1)[:, None]])  # (max_delay + 1, n, act_dim)

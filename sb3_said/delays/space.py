@@ -74,7 +74,7 @@ def scale_action(action: np.ndarray, action_space: spaces.Box) -> np.ndarray:
     >>> scale_action(np.array([0.5]), spaces.Box(-2.0, 2.0, (1,)))
     array([0.25])
     """
-    center, half = _center_and_half(action_space)
+    center, half = center_and_half(action_space)
     return np.clip((action - center) / half, -1.0, 1.0)
 
 
@@ -85,12 +85,20 @@ def unscale_action(scaled_action: np.ndarray, action_space: spaces.Box) -> np.nd
     :param action_space: (act_dim,), with finite bounds
     :return: (..., act_dim), of the action space's type
     """
-    center, half = _center_and_half(action_space)
-    action = (center + half * np.clip(scaled_action, -1.0, 1.0)).astype(action_space.dtype)
-    return np.clip(action, action_space.low, action_space.high)
+    center, half = center_and_half(action_space)
+    return within_bounds(center + half * np.clip(scaled_action, -1.0, 1.0), action_space)
 
 
-def _center_and_half(space: spaces.Box) -> tuple[np.ndarray, np.ndarray]:
+def within_bounds(action: np.ndarray, action_space: spaces.Box) -> np.ndarray:
+    """Return actions in the type of the action space, clipped to its bounds, and rounded where it holds whole numbers.
+
+    :param action: (..., act_dim), in the units of the action space
+    """
+    action = np.rint(action) if np.issubdtype(action_space.dtype, np.integer) else action
+    return np.clip(action, action_space.low, action_space.high).astype(action_space.dtype)
+
+
+def center_and_half(space: spaces.Box) -> tuple[np.ndarray, np.ndarray]:
     """Return the middle of the bounds and half their distance, (act_dim,) float64 each."""
     low, high = 0.5 * space.low.astype(np.float64), 0.5 * space.high.astype(np.float64)
     return low + high, high - low  # halved first: their own type may not hold the distance

@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Iterable
 from typing import Any, ClassVar, TypeVar
 
+import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -131,7 +132,9 @@ class SafeSaveMixin(OffPolicyAlgorithm):
         :raises SavedFileError: if the file is damaged, foreign, forged, newer than this package or of another class,
             or does not go with the environment or the arguments
         """
-        path, device = existing(path), get_device(device)  # what torch does not know is no fault of the file
+        path, device = existing(path), get_device(device)
+        th.zeros(1).to(device)  # a device or a task that is not there is no fault of the file
+        env = gym.make(env) if isinstance(env, str) else env
         if print_system_info:
             get_system_info()
             print("Saved with", load_metadata(path)["versions"])
@@ -202,7 +205,8 @@ class SafeSaveMixin(OffPolicyAlgorithm):
     ) -> None:
         """Take over networks and optimizers from state dicts, as SB3 does, or from a file of :meth:`save`.
 
-        Settings stay this agent's own, also those of ``SAID.set_planner``.
+        Settings stay this agent's own, also those of ``SAID.set_planner``. State dicts hold none, so give those of an
+        agent with the same settings; a file is checked for them.
 
         :param exact_match: refuse parameters that lack a part; False takes those that are given
         :raises SavedFileError: if the file cannot be read or does not fit
@@ -213,6 +217,8 @@ class SafeSaveMixin(OffPolicyAlgorithm):
         path = existing(load_path_or_dict)
         saved = load_tree(path, kind=None)
         with readable(path, explained=(ValueError,)):
+            if not isinstance(saved, dict) or "parameters" not in saved:
+                raise SavedFileError("it holds no agent, which save() or a checkpoint writes")
             self._check_file(saved)
             n_updates = saved["counters"]["_n_updates"]
             check_numbers("_n_updates", n_updates)

@@ -49,6 +49,7 @@ def as_data(value: Any, where: str) -> Any:
     :param where: the argument's name, for the error
     :raises ValueError: for a function, or an object or class that is not in the tables of this module
     """
+    value = value.item() if isinstance(value, np.str_) else value
     cls = type(value)
     if cls is dict:
         return {key: as_data(item, f"{where}[{key!r}]") for key, item in value.items()}

@@ -48,6 +48,26 @@ class CheckpointClock:
     def is_due(self) -> bool:
         return time.monotonic() >= self._due
 
+    def save(self, what: str, state: dict[str, Any], metadata: dict[str, Any] | None = None) -> bool:
+        """Write it and wait for the next; return whether it is written.
+
+        A full disk is no reason to lose what learns: a warning says so, and the checkpoint before stays.
+
+        :param what: the checkpoint's name, for the warning
+        """
+        try:
+            save_tree(self.path, state, metadata)
+        except OSError as error:
+            warnings.warn(
+                f"{what} could not be written to {self.path} ({error}). Training goes on; make room, or a crash loses "
+                "what was learned since the last one.",
+                stacklevel=3,
+            )
+            return False
+        finally:
+            self.wait()
+        return True
+
 
 class TrainingCheckpointCallback(BaseCallback):
     """Write everything that a run needs to go on, from time to time and when learning ends.
@@ -80,11 +100,14 @@ class TrainingCheckpointCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._tried_at = self.model.num_timesteps
-        self._saved_at = self._tried_at if self.path.exists() else -1
+        is_there = self.path.exists()
+        self._saved_at = self._tried_at if is_there and self._tried_at > 0 else -1
         self._clock.wait()
         assert isinstance(self.model, SafeSaveMixin)
-        if self._saved_at < 0 and self.keeps_replay and _replay_buffer(self.model).size() > 0:
-            self.save()  # a resume makes an agent anew, and has the replay that this one was given from nowhere else
+        # A resume makes an agent anew: it has the replay that this one was given from nowhere else, and would take a
+        # checkpoint that another run has left in this folder
+        if self._saved_at < 0 and (is_there or (self.keeps_replay and _replay_buffer(self.model).size() > 0)):
+            self.save()
 
     def _on_rollout_start(self) -> None:
         # Here, and not in on_step, the replay buffer holds every step taken and the updates have caught up with it.
@@ -116,16 +139,8 @@ class TrainingCheckpointCallback(BaseCallback):
             state = training_state(self.model, self.locals.get("callback"), self.keeps_replay)
             check_finite(state, self.path)
             monitors = {file.name: file.stat().st_size for file in self.path.parent.glob("*.monitor.csv")}
-            try:
-                save_tree(self.path, state, {"monitors": monitors})
+            if self._clock.save(f"The checkpoint of step {self._tried_at}", state, {"monitors": monitors}):
                 self._saved_at = self._tried_at
-            except OSError as error:
-                warnings.warn(
-                    f"The checkpoint of step {self._tried_at} could not be written to {self.path} ({error}). Training "
-                    "goes on; make room, or a crash loses what was learned since the last one.",
-                    stacklevel=2,
-                )
-            self._clock.wait()
         return self._saved_at == self._tried_at
 
 
@@ -306,7 +321,7 @@ def _check_evaluation(saved: dict[str, Any]) -> None:
     if any(type(rows) is not list or len(rows) != len(results[0]) for rows in results):
         raise SavedFileError("evaluations differ in how many they are")
     successes = saved[_SUCCESSES]
-    if type(successes) is not list or len(successes) not in (0, len(results[0])):
+    if type(successes) is not list or len(successes) > len(results[0]):  # fewer, where some evaluations told none
         raise SavedFileError("evaluations differ in how many they are")
     if any(np.asarray(rows).dtype.kind not in "bif" for rows in (*results, successes) if rows):
         raise SavedFileError("evaluations hold more than numbers")

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+import torch as th
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
 from torch.nn import functional as F
 
 from sb3_said.offline.learning import OfflineAlgorithm
 from sb3_said.sac.policies import DelayedSACPolicy
+
+
+class BCPolicy(DelayedSACPolicy):
+    """Answers with the mean, also where a draw is asked for: how actions spread is not trained."""
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return super()._predict(observation, deterministic=True)
 
 
 class BC(OfflineAlgorithm):
@@ -24,6 +33,8 @@ class BC(OfflineAlgorithm):
     :param normalise_states: read z-scores of states, with mean and deviation of the dataset (CORL's BC: ``normalize``)
     :param sac_kwargs: every other argument of :class:`~sb3_said.sac.DelayedSAC`; those of its critics have no effect
     """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": BCPolicy, "MultiInputPolicy": BCPolicy}
 
     def __init__(
         self,
@@ -41,21 +52,14 @@ class BC(OfflineAlgorithm):
         return {**super()._policy_flags(), "normalise_states": self.normalise_states}
 
     def take_dataset(self, dataset: Any, progress_bar: bool = False) -> None:
-        """Replace the replay buffer by a dataset, as every offline algorithm does, and look at its states."""
+        """Replace the replay buffer by a dataset, as every offline algorithm does, and look at its states.
+
+        The scale of states stays what it was once weights have learned with it.
+        """
         super().take_dataset(dataset, progress_bar)
-        if self.policy.state_normalizer is not None:
+        if self.policy.state_normalizer is not None and self._n_updates == 0:
             states = self.replay_buffer.window_source(env=self._vec_normalize_env).start_states()  # (N, obs_dim)
             self.policy.state_normalizer.fit(states.to(self.device), 0)
-
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = True,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Answer as SB3's ``predict`` does, always with the mean: ``deterministic=False`` changes nothing."""
-        return super().predict(observation, state, episode_start, deterministic=True)
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
         """Make gradient steps on batches of the replay buffer."""

@@ -51,7 +51,7 @@ class PlannerBelief:
         """Return the one present that no initial noise leads to, or that is guessed: (B, obs_dim)."""
         if self.planner.config.present == "guessed":
             return self.planner.guess(state, action_history, delay)[0]
-        return self.planner.plan(state, action_history, delay, n_candidates=1, temperature=0.0).present
+        return self.planner.plan(state, action_history, delay, temperature=0.0).present
 
 
 class LearnedBelief(ZScored):
@@ -191,11 +191,11 @@ class BeliefOnly:
 
     def __init__(self, belief: Belief, actor: Any, device: th.device | str = "cpu"):
         space = actor.observation_space
-        is_dict = isinstance(space, spaces.Dict)
-        if not (isinstance(space, spaces.Box) or (is_dict and "action_history" in space.spaces)):
+        is_delayed = isinstance(space, spaces.Dict) and "action_history" in space.spaces
+        if not (isinstance(space, spaces.Box) or is_delayed):
             raise ValueError(f"The actor reads {space}; expected states, or those of a DelayedObservationWrapper.")
         self.belief, self.actor, self.device = belief, actor, th.device(device)
-        self.history_shape = space["action_history"].shape if is_dict else None
+        self.age_0_spaces = {key: box for key, box in space.items() if key != "observation"} if is_delayed else None
 
     @th.no_grad()
     def present(self, observation: Observation) -> np.ndarray:
@@ -226,12 +226,8 @@ class BeliefOnly:
         is_batch = np.ndim(observation["delay"]) == 2
         batch = observation if is_batch else {key: np.asarray(value)[None] for key, value in observation.items()}
         present: Any = self.present(batch)
-        if self.history_shape is not None:
-            n = len(present)
-            present = {
-                "observation": present,
-                "action_history": np.zeros((n, *self.history_shape), np.float32),
-                "delay": np.zeros((n, 1), np.float32),
-            }
+        if self.age_0_spaces is not None:  # nothing was sent since, and no other state is known
+            zeros = {key: np.zeros((len(present), *box.shape), np.float32) for key, box in self.age_0_spaces.items()}
+            present = {"observation": present, **zeros}
         action, state = self.actor.predict(present, state, episode_start, deterministic)
         return (action if is_batch else action[0]), state

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_said.delays.space import scale_action
+from sb3_said.delays.space import center_and_half, scale_action
 
 ACTION_TOLERANCE = 1e-3  # of half the range: what float32 and a tanh leave beyond the bounds
 
@@ -64,6 +64,7 @@ def checked(name: str, columns: Columns, state_space: spaces.Box, box: spaces.Bo
     floats = {}
     for key, expected in (shapes | {"next_observations": state_space.shape}).items():
         values = _numbers(name, key, columns[key])
+        values = values[:, None] if values.ndim == 1 and expected == (1,) else values
         if values.shape[1:] != expected:
             raise ValueError(
                 f"{name} has {key} of shape {values.shape[1:]}, and the task {expected}: it is of another task."
@@ -74,8 +75,8 @@ def checked(name: str, columns: Columns, state_space: spaces.Box, box: spaces.Bo
         _refuse(name, ~is_finite, f"{key} must be finite", values)
     states, next_states, actions = (floats[key] for key in ("observations", "next_observations", "actions"))
     ends, terminated = columns["ends"], columns["terminated"]
-    half = (box.high - box.low) / 2
-    outside = np.any(np.abs(actions - (box.low + box.high) / 2) > half * (1 + ACTION_TOLERANCE), axis=1)
+    center, half = center_and_half(box)
+    outside = np.any(np.abs(actions - center) > half * (1 + ACTION_TOLERANCE), axis=1)
     _refuse(name, outside, f"the action is outside the bounds {box}", actions)
     _refuse(name, terminated & ~ends, "the task ended, and the trajectory goes on", terminated)
     follows = np.all(np.isclose(next_states[:-1], states[1:], rtol=1e-3, atol=1e-3), axis=1) | ends[:-1]

@@ -75,6 +75,7 @@ class Dataset:
         observation_space: spaces.Space[Any],
         action_space: spaces.Space[Any],
         draw_ages: Callable[[int], np.ndarray] | None = None,
+        buffer_class: type[DelayedReplayBuffer] = DelayedReplayBuffer,
         **buffer_kwargs: Any,
     ) -> DelayedReplayBuffer:
         """Fill a replay buffer as if an agent had collected these episodes.
@@ -83,11 +84,12 @@ class Dataset:
         :param action_space: the task's
         :param draw_ages: returns the ages at which an episode of n steps would be observed, from its first to its final
             state: (n + 1,) int. Ages are 0 by default, which is all that a planner and values need
-        :param buffer_kwargs: of :class:`~sb3_said.replay.DelayedReplayBuffer`
+        :param buffer_class: to fill
+        :param buffer_kwargs: of that :class:`~sb3_said.replay.buffer.DelayedReplayBuffer`
         """
         max_delay = check_spaces(observation_space, action_space).max_delay
         size = max(len(self) + 1, max_delay + 2)  # a full buffer has lost its oldest past, and does not sample it
-        buffer = DelayedReplayBuffer(size, observation_space, action_space, **buffer_kwargs)
+        buffer = buffer_class(size, observation_space, action_space, **buffer_kwargs)
         ends, lengths = np.flatnonzero(self.ends), self.lengths
         ages, tail_ages = np.zeros(len(self), np.int16), np.zeros(len(ends), np.int16)
         for i, (end, length) in enumerate(zip(ends, lengths, strict=True)):

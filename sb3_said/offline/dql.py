@@ -21,6 +21,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_said.offline.learning import OfflineAlgorithm
+from sb3_said.planner.checks import check_settings
 from sb3_said.sac.policies import DelayedSACPolicy, each_part, rows_of, seed_of, settings_of
 
 
@@ -51,11 +52,11 @@ class DQLConfig:
 
     def __post_init__(self) -> None:
         low = {"denoising_steps": 1, "hidden": 1, "time_embedding": 4, "eta": 0, "n_candidates": 1, "ema_every": 1}
-        for name, smallest in low.items():
-            if not getattr(self, name) >= smallest:
-                raise ValueError(f"{name} is {getattr(self, name)}, expected at least {smallest}.")
+        check_settings(self, low, may_lack=("max_grad_norm",))
         if self.time_embedding % 2:
             raise ValueError(f"time_embedding is {self.time_embedding}, expected an even number: of sines and cosines.")
+        if self.max_grad_norm is not None and not self.max_grad_norm > 0:
+            raise ValueError(f"max_grad_norm is {self.max_grad_norm}, expected a number above 0, or None.")
         if not 0 < self.beta_min < self.beta_max or not 0 <= self.ema_decay < 1:
             raise ValueError(
                 f"beta_min, beta_max and ema_decay are {self.beta_min}, {self.beta_max} and {self.ema_decay}, expected "

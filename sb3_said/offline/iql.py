@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import copy
-import math
 from dataclasses import asdict, dataclass
-from numbers import Integral, Real
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +13,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_said.offline.datasets import Dataset
-from sb3_said.planner.checks import check_same
+from sb3_said.planner.checks import check_same, check_settings
 from sb3_said.planner.plain import ZScored
 
 SMALLEST_SPREAD = 0.1  # of returns, in the size of the largest: else a log of equal ones would be scaled without end
@@ -49,16 +47,14 @@ class IQLConfig:
     """for each of the planner's (ours: the planner has few where it learns within hours; the paper has one)"""
 
     def __post_init__(self) -> None:
-        for name in ("hidden", "batch_size", "updates"):
-            if not isinstance(value := getattr(self, name), Integral) or value < 1:
-                raise ValueError(f"{name} is {value!r}, expected a whole number, at least 1.")
-        for name, fits, expected in (
-            ("expectile", lambda x: 0.5 <= x < 1, "0.5 (the mean) up to, not with, 1"),
-            ("learning_rate", lambda x: 0 < x < math.inf, "a number above 0"),
-            ("target_rate", lambda x: 0 < x <= 1, "a number above 0 and at most 1"),
-        ):
-            if not isinstance(value := getattr(self, name), Real) or not fits(value):
-                raise ValueError(f"{name} is {value!r}, expected {expected}.")
+        check_settings(self, {"hidden": 1, "batch_size": 1, "updates": 1})
+        if not 0.5 <= self.expectile < 1:
+            raise ValueError(f"expectile is {self.expectile}, expected a number from 0.5, the mean, up to below 1.")
+        if not self.learning_rate > 0 or not 0 < self.target_rate <= 1:
+            raise ValueError(
+                f"learning_rate is {self.learning_rate} and target_rate {self.target_rate}, expected numbers above 0, "
+                "the second at most 1."
+            )
 
 
 class ImplicitValues(ZScored):

@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_said.delays.receivers import Actuator, NewestPacket
 from sb3_said.delays.space import ages_of
 from sb3_said.offline.datasets import Dataset, load_dataset
+from sb3_said.planner.checks import check_intervals
 from sb3_said.sac import DelayedSAC
 
 SelfOffline = TypeVar("SelfOffline", bound="OfflineAlgorithm")
@@ -82,6 +83,7 @@ class OfflineAlgorithm(DelayedSAC):
         :param progress_bar: show one
         :raises ValueError: as ``load_dataset`` does, and without the wrapper that gives a delayed agent its ages
         """
+        check_intervals(log_interval=log_interval)
         if isinstance(self.observation_space, spaces.Dict) and self._draw_ages() is None:
             raise ValueError(
                 f"{type(self).__name__} learns at the ages that a DelayedObservationWrapper gives, and has none: give "
@@ -150,8 +152,10 @@ class OfflineAlgorithm(DelayedSAC):
             self.observation_space,
             self.action_space,
             self._draw_ages(),
+            self.replay_buffer_class,  # type: ignore[arg-type]  # as _setup_model saw to
             device=self.device,
             relabelled_ages=self.relabelled_ages,
+            **self.replay_buffer_kwargs,
         )
 
     def _draw_ages(self) -> Callable[[int], np.ndarray] | None:
@@ -193,8 +197,7 @@ def take_statistics(vec_normalize: VecNormalize, data: Dataset) -> None:
 
 def listed(callback: MaybeCallback | tuple[BaseCallback, ...]) -> list[BaseCallback]:
     """Return callbacks, in any form that SB3 takes, as a list."""
-    if isinstance(callback, (list, tuple)):
-        return list(callback)
-    if callback is None or isinstance(callback, BaseCallback):
-        return [] if callback is None else [callback]
-    return [ConvertCallback(callback)]
+    if callback is None:
+        return []
+    given = callback if isinstance(callback, (list, tuple)) else [callback]
+    return [each if isinstance(each, BaseCallback) else ConvertCallback(each) for each in given]

@@ -171,15 +171,21 @@ def read_buffer(buffer: ReplayBuffer) -> Log:
     return Log(name, None, "", parts, is_scaled=True)
 
 
+def import_minari(what: str) -> Any:
+    """:raises ImportError: where it is missing; it names what needs it"""
+    try:
+        import minari
+    except ImportError as error:
+        raise ImportError(f"{what} needs Minari: {MINARI}.") from error
+    return minari
+
+
 def read_minari(source: Any, progress_bar: bool) -> Log:
     """Read a Minari dataset, by its id or as it was loaded; an id that is not local is downloaded.
 
     :raises ValueError: where there is none, for a damaged one, and where observations are no vectors
     """
-    try:
-        import minari
-    except ImportError as error:
-        raise ImportError(f"The dataset {source} needs Minari: {MINARI}.") from error
+    minari = import_minari(f"The dataset {source}")
     if isinstance(source, (str, os.PathLike)):
         try:
             source = minari.load_dataset(os.fspath(source), download=True)

@@ -15,7 +15,7 @@ from sb3_said.delays.space import check_spaces, unscale_action
 from sb3_said.files.atomic import check_writable, replacing
 from sb3_said.offline.datasets import Dataset, is_file
 from sb3_said.offline.scores import reference_returns
-from sb3_said.offline.sources import MINARI, TASK
+from sb3_said.offline.sources import TASK, import_minari
 
 
 def check_target(target: str | os.PathLike[str]) -> None:
@@ -36,7 +36,7 @@ def check_target(target: str | os.PathLike[str]) -> None:
     name = os.fspath(target)
     if not name.rpartition("-v")[2].isdigit():
         raise ValueError(f"{name!r} is neither an .npz nor an id of Minari, which ends in its version: {name}-v0.")
-    minari = _minari()
+    minari = import_minari(f"{name} is no .npz, and")
     from minari.dataset.minari_dataset import parse_dataset_id
 
     try:
@@ -76,6 +76,7 @@ def write_dataset(
         with replacing(target) as file:
             np.savez(file, **columns)
         return
+    import minari
     from minari.data_collector import EpisodeBuffer
 
     stops = np.flatnonzero(data.ends) + 1
@@ -100,7 +101,7 @@ def write_dataset(
         )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # that nobody is named as its author, nor a link to its code
-        _minari().create_dataset_from_buffers(
+        minari.create_dataset_from_buffers(
             os.fspath(target),
             buffers,
             env=spec,
@@ -110,11 +111,3 @@ def write_dataset(
             action_space=env.action_space,
             **scores,
         )
-
-
-def _minari() -> Any:
-    try:
-        import minari
-    except ImportError as error:
-        raise ImportError(f"Minari is missing: {MINARI}, or write an .npz.") from error
-    return minari

@@ -2,9 +2,71 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import fields
+from numbers import Integral, Real
 from typing import Any
 
 import torch as th
+
+
+def check_settings(
+    config: Any,
+    at_least: Mapping[str, float],
+    at_most: Mapping[str, float] | None = None,
+    choices: Mapping[str, Collection[str]] | None = None,
+    may_lack: Collection[str] = (),
+) -> None:
+    """Hold the settings of a dataclass against their defaults, whose types they have.
+
+    :param at_least: the smallest value of some of them
+    :param at_most: the largest
+    :param choices: what the texts among them may be; None, too, where that is the default
+    :param may_lack: numbers that may be None
+    :raises ValueError: for another type, a number that is not finite or out of range, or no such choice
+    """
+    choices, at_most = choices or {}, at_most or {}
+    for field in fields(config):
+        name, value, default = field.name, getattr(config, field.name), field.default
+        if isinstance(default, bool):
+            fits, expected = isinstance(value, bool), "True or False"
+        elif isinstance(default, int):
+            fits, expected = isinstance(value, Integral) and not isinstance(value, bool), "a whole number"
+        elif isinstance(default, tuple):
+            fits = isinstance(value, (tuple, list)) and len(value) == 2
+            fits, expected = fits and all(_is_number(x) and 0 <= x < 1 for x in value), "two numbers in [0, 1)"
+        elif name in choices:
+            fits, expected = value in choices[name] or value is default is None, f"one of {choices[name]}"
+        else:
+            fits, expected = _is_number(value) or (name in may_lack and value is None), "a finite number"
+        if not fits:
+            raise ValueError(f"{name} is {value!r:.50}, expected {expected}.")
+        if name in at_least and value is not None and value < at_least[name]:
+            raise ValueError(f"{name} is {value}, expected at least {at_least[name]}.")
+        if name in at_most and value > at_most[name]:
+            raise ValueError(f"{name} is {value}, expected at most {at_most[name]}.")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def check_intervals(**intervals: int | None) -> None:
+    """:raises ValueError: for one that is given and below 1, or no whole number"""
+    for name, interval in intervals.items():
+        if interval is not None:
+            whole(name, interval)
+
+
+def whole(name: str, given: float, least: int = 1) -> int:
+    """Return a count; 1e4 is a float in YAML and in -params.
+
+    :raises ValueError: for one below the least, or no whole number
+    """
+    if given < least or given % 1 != 0:
+        raise ValueError(f"{name} must be a whole number, at least {least}, got {given}.")
+    return int(given)
 
 
 def check_same(what: str, before: dict[str, Any], now: dict[str, Any], advice: str) -> None:

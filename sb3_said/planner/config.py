@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import asdict, dataclass, fields, replace
-from numbers import Integral, Real
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+import numpy as np
+
+from sb3_said.planner.checks import check_settings
 from sb3_said.planner.diffusion import PREDICTIONS, SCHEDULES, TIME_SAMPLINGS
 from sb3_said.planner.dit import HEAD_DIM
 from sb3_said.planner.values import VALUE_SCALES
@@ -31,6 +32,9 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "value_scale": VALUE_SCALES,
     "precision": ("auto", "float32", "bfloat16"),
 }
+AT_LEAST = {"depth": 1, "horizon": 2, "sampling_steps": 1, "n_candidates": 1, "batch_size": 1} | dict.fromkeys(
+    ("temperature", "choice_factor", "warmup_steps", "weight_decay", "weight_factor", "decision_weight"), 0
+)
 #: Far beyond what helps: a setting above is a slip, and would ask for memory or hours.
 AT_MOST = {"depth": 1000, "d_model": 16_384, "horizon": 1000, "sampling_steps": 1000, "n_candidates": 10_000}
 
@@ -117,17 +121,12 @@ class PlannerConfig:
     precision: str = "auto"  # bfloat16 autocast where the hardware has it; or "float32", "bfloat16"
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            _check_setting(field.name, getattr(self, field.name), field.default)
+        for name, value in vars(self).items():
+            if isinstance(value, np.generic):
+                object.__setattr__(self, name, value.item())  # which JSON can hold
+        check_settings(self, AT_LEAST, AT_MOST, CHOICES, may_lack=("choice_factor", "gradient_clip"))
         self._settle_present()
         object.__setattr__(self, "betas", tuple(self.betas))  # JSON gives a list back
-        at_least = {"depth": 1, "horizon": 2, "sampling_steps": 1, "n_candidates": 1, "batch_size": 1}
-        at_least |= {"temperature": 0, "warmup_steps": 0, "weight_decay": 0, "weight_factor": 0, "decision_weight": 0}
-        if self.choice_factor is not None:
-            at_least["choice_factor"] = 0
-        for name, smallest in at_least.items():
-            if not getattr(self, name) >= smallest:
-                raise ValueError(f"{name} is {getattr(self, name)}, expected at least {smallest}.")
         if self.d_model < HEAD_DIM or self.d_model % HEAD_DIM:
             raise ValueError(f"d_model is {self.d_model}, expected a multiple of {HEAD_DIM}.")
         if not self.learning_rate > 0 or not (self.gradient_clip is None or self.gradient_clip > 0):
@@ -209,27 +208,3 @@ class PlannerConfig:
             precision="float32",
         )
         return replace(config, **changes)  # type: ignore[arg-type]
-
-
-def _check_setting(name: str, value: Any, default: Any) -> None:
-    """:raises ValueError: for another type than the default's, a number that is not finite, or one above ``AT_MOST``"""
-    if isinstance(default, bool):
-        fits, expected = isinstance(value, bool), "True or False"
-    elif isinstance(default, int):
-        fits, expected = isinstance(value, Integral) and not isinstance(value, bool), "a whole number"
-    elif isinstance(default, tuple):
-        fits = isinstance(value, (tuple, list)) and len(value) == 2 and all(_is_number(x) and 0 <= x < 1 for x in value)
-        expected = "two numbers in [0, 1)"
-    elif name in CHOICES:
-        fits, expected = value in CHOICES[name] or (value is None and default is None), f"one of {CHOICES[name]}"
-    else:
-        may_lack = name in ("choice_factor", "gradient_clip")
-        fits, expected = _is_number(value) or (may_lack and value is None), "a finite number"
-    if not fits:
-        raise ValueError(f"{name} is {value!r:.50}, expected {expected}.")
-    if name in AT_MOST and value > AT_MOST[name]:
-        raise ValueError(f"{name} is {value}, expected at most {AT_MOST[name]}.")
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)

@@ -4,24 +4,25 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
-from sb3_said.delays.space import has_state_history
+from sb3_said.delays.space import has_state_history, within_bounds
 from sb3_said.realtime.ledger import Request
 
 
+@dataclass(frozen=True)
 class Asking:
-    """Asks a model.
+    """Asks a model; what it holds is as of :class:`~sb3_said.realtime.ControlLoop`."""
 
-    :param model: as of :class:`~sb3_said.realtime.ControlLoop`, as are the others
-    :param max_delay: D, that it was built for
-    """
-
-    def __init__(self, model: Any, max_delay: int, deterministic: bool, normalize: Callable[[Any], Any] | None):
-        self.model, self.max_delay, self.deterministic, self.normalize = model, max_delay, deterministic, normalize
+    model: Any
+    max_delay: int
+    """D, that the model was built for"""
+    deterministic: bool
+    normalize: Callable[[Any], Any] | None
 
     def answer(self, request: Request) -> tuple[np.ndarray, float]:
         """Return the actions from the request's target on, (K, act_dim), and the seconds that the model took.
@@ -50,7 +51,7 @@ class Asking:
             raise ValueError(
                 f"It answers {actions} of the shape {actions.shape}, expected (K, {space.shape[0]}) and finite."
             )
-        return np.clip(actions, space.low, space.high).astype(space.dtype), seconds
+        return within_bounds(actions, space), seconds
 
     def warm_up(self) -> float:
         """Run dummy answers until one takes no longer than later ones, and return the seconds that it took."""

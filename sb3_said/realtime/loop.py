@@ -6,7 +6,7 @@ import math
 import threading
 import time
 import warnings
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -16,7 +16,7 @@ from sb3_said.delays.processes import checked_count
 from sb3_said.delays.space import check_spaces, unscale_action
 from sb3_said.realtime.asking import Asking
 from sb3_said.realtime.ledger import Ledger, NoAnswer, Request
-from sb3_said.realtime.statistics import LoopStatistics, percentile
+from sb3_said.realtime.statistics import LoopStatistics
 
 #: Newest answers that tell how many steps the next one will take, and the share of them that this covers.
 ANSWERS_REMEMBERED, ANSWERS_COVERED = 100, 0.95
@@ -246,8 +246,14 @@ class ControlLoop:
         """
         ends = None if timeout is None else time.monotonic() + timeout
         with self._changed:
+            if self._simulate is not None:
+                self._check()
+                self._stands = self.n_sent == 0
+                self._pretend(self._simulate, waits=True)
+                self._stands = False
+                return True
             is_answered = self._wait(ends)
-            if is_answered and self._simulate is None and self.n_sent == 0 and not self._ledger.is_planned(0):
+            if is_answered and self.n_sent == 0 and not self._ledger.is_planned(0):
                 self._stands = True
                 self._ask()
                 is_answered = self._wait(ends)
@@ -269,7 +275,7 @@ class ControlLoop:
         enough = self._n_answers + 2  # the worker may never be idle; the second one it will have begun after this
 
         def is_over() -> bool:
-            has_stopped = self._is_closing or self._error is not None or self._simulate is not None
+            has_stopped = self._is_closing or self._error is not None
             return has_stopped or self._n_answers >= enough or not (self._is_busy or self._asked)
 
         is_answered = self._changed.wait_for(is_over, None if ends is None else ends - time.monotonic())
@@ -336,15 +342,19 @@ class ControlLoop:
                 self._error, self._is_busy = error, False
                 self._changed.notify_all()
 
-    def _pretend(self, busy_steps: Callable[[float], int]) -> None:
-        """Be a worker that is busy for some steps, at the moment before an action is sent."""
+    def _pretend(self, busy_steps: Callable[[float], int], waits: bool = False) -> None:
+        """Be a worker that is busy for some steps, at the moment before an action is sent.
+
+        :param waits: whether the robot waits for its answers
+        """
         for may_ask in (True, False):
             # While the robot stands no step goes by, by which an answer could be waited for
-            if self._in_flight is not None and (self._stands or self._in_flight[2] <= self.n_sent):
+            is_there = waits or self._stands
+            if self._in_flight is not None and (is_there or self._in_flight[2] <= self.n_sent):
                 request, actions, _ = self._in_flight
                 self._in_flight = None
                 self._take(request, actions)
-            if may_ask and self._in_flight is None:
+            if may_ask and self._in_flight is None and (self._has_heard or not waits):
                 asked = self._next_request()
                 if asked is not None:
                     actions, seconds = self._asking.answer(asked)
@@ -359,7 +369,7 @@ class ControlLoop:
             took = ledger.n_sent - request.n_sent
             self._statistics.count(answer_steps=took)
             self._took.append(took)
-            self._expect(int(percentile(Counter(self._took), ANSWERS_COVERED)))
+            self._expect(sorted(self._took)[math.ceil(ANSWERS_COVERED * len(self._took)) - 1])
         if self.count_latency:
             self._statistics.late_answers += ledger.splice(actions, request.target) > 0
         else:

@@ -8,7 +8,6 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection
-from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
 import numpy as np
@@ -73,10 +72,9 @@ class ModelProcess:
             self._process.join()
 
     def _call(self, *question: Any) -> Any:
-        message = ForkingPickler.dumps(question)
         with self._lock:
             try:
-                self._pipe.send_bytes(message)
+                self._pipe.send(question)
             except OSError as error:
                 raise RuntimeError("The model's process has ended; make another one.") from error
             return self._receive()

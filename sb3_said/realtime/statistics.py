@@ -6,27 +6,12 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
 #: Larger ages, answer times and gaps are counted as this many steps or periods.
 LARGEST_COUNTED = 1_000
 #: What is reported of each distribution; the last is the maximum.
 PERCENTILES = {"p50": 0.50, "p95": 0.95, "p99": 0.99, "max": 1.0}
-
-
-def percentile(counts: Counter[Any], share: float) -> float:
-    """Return the smallest value that at least a share of all are not above (nearest rank).
-
-    :param counts: how often each value was met, at least one
-    :param share: in (0, 1]
-
-    >>> percentile(Counter([1, 1, 1, 9]), 0.75), percentile(Counter([1, 1, 1, 9]), 0.76)
-    (1.0, 9.0)
-    """
-    reached, needed = 0, share * counts.total()
-    for value in sorted(counts):
-        reached += counts[value]
-        if reached >= needed - 1e-9:
-            return float(value)
-    raise ValueError("A percentile needs at least one value, got none; let the loop act first.")
 
 
 @dataclass
@@ -76,7 +61,9 @@ class LoopStatistics:
         found: dict[str, float] = {}
         for name, counts in (("age", self.ages), ("answer_steps", self.answer_steps), ("gap", self.gaps)):
             if counts:
-                found |= {f"{name}_{key}": percentile(counts, share) for key, share in PERCENTILES.items()}
+                values, weights, shares = [*counts], [*counts.values()], [*PERCENTILES.values()]
+                ranked = np.quantile(values, shares, weights=weights, method="inverted_cdf")  # values that were met
+                found |= {f"{name}_{key}": float(value) for key, value in zip(PERCENTILES, ranked, strict=True)}
         return found | {name: value for name, value in vars(self).items() if isinstance(value, int)}
 
     def __str__(self) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_said.said.learning import check_intervals
+from sb3_said.planner.checks import check_intervals
 
 
 class PlannerTrainingCallback(BaseCallback):
@@ -41,8 +41,8 @@ class PlannerTrainingCallback(BaseCallback):
         if unknown := sorted(set(intervals) - {"log_interval", "eval_interval", "save_interval"}):
             raise TypeError(f"PlannerTrainingCallback has no argument {', '.join(unknown)}.")
         check_intervals(**intervals)  # and not when the planner is trained, after all of learn()'s steps
-        self.how: dict[str, Any] = {"folder": folder, "progress_bar": progress_bar, "should_stop": should_stop}
-        self.how |= intervals
+        how = {"folder": folder, "progress_bar": progress_bar, "should_stop": should_stop}
+        self.how: dict[str, Any] = {**how, **intervals}
 
     def _on_training_start(self) -> None:
         if self.model.num_timesteps < self.model._planner_trained_at:  # counting began anew

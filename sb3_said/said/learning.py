@@ -14,8 +14,10 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import configure_logger
 
 from sb3_said.delays.space import ages_of
+from sb3_said.files.normalization import get_statistics, set_statistics
 from sb3_said.offline import IQL, ImplicitValues, OfflineAlgorithm, load_dataset
 from sb3_said.planner import InpaintingPlanner
+from sb3_said.planner.checks import check_intervals, whole
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.planner.values import returns_to_go
 from sb3_said.said.policies import SAIDPolicy, Value
@@ -140,8 +142,6 @@ class PlannerLearner(OfflineAlgorithm):
             return training, training.run(progress_bar, should_stop)
 
         training, outcome = train(self.policy.planner)
-        if training.trainer.n_updates > 0:
-            self.policy.set_answer("planner")
         planners = [self.policy.planner]
         for mask in masks_of(self)[1:] if is_tried else []:
             if outcome == "done":
@@ -208,20 +208,15 @@ class PlannerLearner(OfflineAlgorithm):
                 raise KeyboardInterrupt
             watcher.on_training_start(locals() | {"total_timesteps": total, "callback": watcher}, globals())
 
-        is_new = True
+        first = trainer.n_updates + 1
 
         def on_step(n_updates: int) -> bool:
-            nonlocal is_new
             self.num_timesteps = n_updates
-            if is_new or n_updates % HAND_OVER_INTERVAL == 0:  # else an expert that learns nothing would answer
+            if n_updates == first or n_updates % HAND_OVER_INTERVAL == 0:  # else an expert that learns nothing answers
                 training.hand_over()
-                self.policy.set_answer("planner")
-                is_new = False
             return self._goes_on(watcher)
 
         outcome = training.run(should_stop=should_stop, on_step=on_step)
-        if trainer.n_updates > 0:
-            self.policy.set_answer("planner")
         if outcome == "stopped":
             raise KeyboardInterrupt
         watcher.on_training_end()
@@ -295,28 +290,12 @@ class PlannerLearner(OfflineAlgorithm):
         """Take back what a training from logs changes before its first update, if it gets no further."""
         names = "replay_buffer", "num_timesteps", "value"
         before, policy = {name: getattr(self, name) for name in names}, self.policy
-        values, config = policy.values, policy.planner.config
+        values, config, scale = policy.values, policy.planner.config, get_statistics(self._vec_normalize_env)
         try:
             yield
         except BaseException:
             for name, value in before.items():
                 setattr(self, name, value)
             policy.values, policy.planner.config = values, config
+            set_statistics(self._vec_normalize_env, scale)
             raise
-
-
-def check_intervals(**intervals: int | None) -> None:
-    """:raises ValueError: for one that is given and below 1, or no whole number"""
-    for name, interval in intervals.items():
-        if interval is not None:
-            whole(name, interval)
-
-
-def whole(name: str, given: float, least: int = 1) -> int:
-    """Return a count; 1e4 is a float in YAML and in -params.
-
-    :raises ValueError: for one below the least, or no whole number
-    """
-    if given < least or given % 1 != 0:
-        raise ValueError(f"{name} must be a whole number, at least {least}, got {given}.")
-    return int(given)

@@ -19,11 +19,12 @@ from sb3_said.files.archive import PathOrFile
 from sb3_said.files.arguments import from_data
 from sb3_said.offline import IQLConfig, OfflineAlgorithm
 from sb3_said.offline.learning import listed
+from sb3_said.planner.checks import whole
 from sb3_said.planner.config import SAMPLING_SETTINGS, WEIGHT_SETTINGS, PlannerConfig
 from sb3_said.sac import StableSAC
 from sb3_said.sac.policies import settings_of
 from sb3_said.said.callbacks import PlannerTrainingCallback
-from sb3_said.said.learning import PlannerLearner, whole
+from sb3_said.said.learning import PlannerLearner
 from sb3_said.said.policies import Answer, SAIDPolicy, Value
 from sb3_said.said.student import Distillation, distill
 from sb3_said.said.ways import WAY_SETTINGS, check_scored, ways_of
@@ -157,7 +158,8 @@ class SAID(PlannerLearner, StableSAC):
         """Refuse a trained planner of other settings than this agent's, of which its weights mean something else."""
         super()._check_file(saved)
         if saved["parameters"]["policy"].get("planner_updates", 0) > 0:
-            self._check_weights(from_data(saved["arguments"].get("planner_kwargs", {})), WEIGHT_SETTINGS)
+            settings = saved.get("settings") or saved["arguments"]  # of a checkpoint, or of save()
+            self._check_weights(from_data(settings.get("planner_kwargs", {})), WEIGHT_SETTINGS)
 
     def _check_weights(self, given: dict[str, Any], names: Iterable[str]) -> None:
         """:raises ValueError: where a trained planner has other settings than this agent's, of those named"""
@@ -250,7 +252,7 @@ class SAID(PlannerLearner, StableSAC):
             kwargs = {"planner_ways": {}, **kwargs}
         model = super().load(path, *args, **kwargs)
         if model.policy.planner_is_trained:
-            model._check_decider(given.get("decided_by"))
+            model._check_decider(model.planner_kwargs["decided_by"])
         return model
 
     def set_planner(self, **settings: Any) -> None:

@@ -146,8 +146,9 @@ def distill(model: SAID, config: Distillation, progress_bar: bool = False) -> fl
     optimizer = th.optim.Adam(student.network.parameters(), lr=config.learning_rate)
     schedule = th.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, config.gradient_steps)
     rounds = config.rounds if model.env is not None and config.own_steps > 0 else 0
+    visits = {*np.linspace(0, config.gradient_steps, rounds + 2, dtype=int)[1:-1].tolist()}
     for k in tqdm(range(config.gradient_steps), desc="student", disable=not progress_bar):
-        if k > 0 and rounds and k % -(-config.gradient_steps // (rounds + 1)) == 0:
+        if k in visits:
             rows = _Rows.join([rows, _visited(model, "student", -(-config.own_steps // rounds), generator)])
         drawn = th.randint(len(rows.inputs), (config.batch_size,), generator=generator).to(rows.inputs.device)
         loss = _loss(model, rows[drawn], config.q_weight)

@@ -11,7 +11,7 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from tqdm.auto import tqdm
 
-from sb3_said.files.archive import load_tree, readable, save_tree
+from sb3_said.files.archive import load_tree, readable
 from sb3_said.files.checkpoint import CheckpointClock, checksum, evaluations_of, restore_evaluations
 from sb3_said.offline.iql import IQL
 from sb3_said.planner.checks import check_same
@@ -105,7 +105,7 @@ class PlannerTraining:
             outcome = "stopped" if should_stop is not None and should_stop() else "done"
             clock = self._clock
             if clock is not None and (self._is_due(clock, done) or is_end or outcome == "stopped"):
-                self._save_or_warn(clock)
+                clock.save("The planner's checkpoint", self._state())
             return outcome == "done" and goes_on
 
         try:
@@ -125,11 +125,14 @@ class PlannerTraining:
     def hand_over(self) -> None:
         """Give the planner its weights and the agent the values as far as they got; before the first update, none.
 
+        An agent's own planner answers from then on.
+
         :raises FloatingPointError: when an update was not finite; all stays as it was
         """
         self.trainer.hand_over()
         if self.trainer.n_updates > 0 and self.is_agents:
             self.model.policy.planner_updates.fill_(float(self.trainer.n_updates))
+            self.model.policy.set_answer("planner")
             if self.value_trainer is not None:
                 self.model.policy.values.load_state_dict(self.value_trainer.values.state_dict())
 
@@ -170,16 +173,8 @@ class PlannerTraining:
             )
         return losses["planner/loss"]
 
-    def _save_or_warn(self, clock: CheckpointClock) -> None:
-        """Write a checkpoint; a full disk is no reason to lose the planner itself."""
+    def _state(self) -> dict[str, Any]:
+        """Return what a checkpoint holds."""
         values = None if self.value_trainer is None else self.value_trainer.state_dict()
         state = {**self._data, "weighed": self._weighed, "trainer": self.trainer.state_dict(), "values": values}
-        try:
-            save_tree(clock.path, {**state, "evaluations": evaluations_of(self.watcher)})
-        except OSError as error:
-            warnings.warn(
-                f"The planner's checkpoint could not be written to {clock.path} ({error}). Training goes on, and the "
-                "agent keeps its planner; make room, so that it can be saved.",
-                stacklevel=6,
-            )
-        clock.wait()
+        return {**state, "evaluations": evaluations_of(self.watcher)}

@@ -28,13 +28,18 @@ class TrialStopped(KeyboardInterrupt):
 
 @contextmanager
 def stopped_alone() -> Iterator[None]:
-    """Let Ctrl-C end the trial that is played inside, and nothing else."""
+    """Let Ctrl-C, or what is no number in task or planner, end the trial that is played inside, and nothing else."""
     try:
         yield
     except TrialStopped:
         raise
     except KeyboardInterrupt:
         print("The trial was interrupted: the planner answers as it is. train_planner() plays one later.")
+    except ValueError as error:
+        warnings.warn(
+            f"The trial has failed, and the planner answers as it is: {error} train_planner() plays one later.",
+            stacklevel=4,
+        )
 
 
 @dataclass(frozen=True)
@@ -147,6 +152,8 @@ def _play(
             for i in np.flatnonzero(is_played & (dones | (len(ages) == longest))):
                 seen = infos[i].get("episode") or {}  # a Monitor sees the task's own rewards
                 returns[first + i] = seen.get("r", sums[i])
+                if not np.isfinite(returns[first + i]):
+                    raise ValueError(f"A reward of the trial is not finite: an episode returned {returns[first + i]}.")
                 settled_ages[first + i] = _settled_age(np.stack(ages)[:, i], model.policy.max_delay)
                 is_played[i] = False
                 bar.update()

@@ -69,7 +69,7 @@ def test_delays_of_four_tasks(name, noise):
 @pytest.mark.parametrize("name", TASKS)
 @pytest.mark.filterwarnings("ignore:compiler attribute")
 def test_jitter_gives_the_most_frequent_age(name):
-    episodes = play(name, "uniform")
+    episodes = play(name, "uniform", 3000 if name == "Ant-v5" else 2000)  # of which a slow sensor shows a quarter
     for process, expected in [
         (WIFI_20MS, {2}),
         (DroppedPackets(FixedDelay(4), p=0.1), {4}),
@@ -91,6 +91,24 @@ def test_scores_show_how_often_each_age_occurs():
     shares = np.sqrt(np.maximum(found.scores, 0))
     frequencies = np.bincount(ages[ages >= 2], minlength=9)
     np.testing.assert_allclose(shares / shares.sum(), frequencies / frequencies.sum(), atol=0.1)
+
+
+@pytest.mark.parametrize(
+    "process",
+    [PeriodicPackets(FixedDelay(3), 2), PeriodicPackets(FixedDelay(3), 5), DroppedPackets(FixedDelay(3), p=0.5)],
+)
+def test_a_slow_sensor_of_positions(process):
+    # the newest change that was seen tells the velocity; the row before may repeat what was seen, which tells nothing
+    rng, episodes = np.random.default_rng(0), []
+    for force in rng.uniform(-1, 1, (4, 750)):
+        velocity = np.zeros(751)
+        for t, f in enumerate(force):
+            velocity[t + 1] = 0.8 * velocity[t] + 0.2 * f
+        episodes.append((velocity.cumsum()[:, None], force[:, None]))
+    observations, actions, ages = delayed(episodes, process)
+    found = estimate_delay(observations, actions)
+    assert 3 <= found.delay <= ages.max() and found.confidence > 0.9
+    assert found.scores[ages.max() + 2 :].max() < 0.1 * found.scores.max()
 
 
 @pytest.mark.parametrize("delay", [0, 5])

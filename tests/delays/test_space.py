@@ -20,6 +20,7 @@ from sb3_said.delays.space import (
     check_spaces,
     delayed_space,
     has_state_history,
+    within_bounds,
     written_ages,
 )
 
@@ -89,6 +90,19 @@ def test_scaled_actions_go_to_one_and_back(low, high, dtype):
     back = unscale_action(scale_action(actions, space), space)
     assert back.dtype == space.dtype and all(space.contains(action) for action in back)
     assert np.all(np.abs(back.astype(float) - actions) <= 1e-7 * (space.high.astype(float) - space.low))
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "dtype"), [(0, 10, np.int64), (-128, 127, np.int8), (-100, 100, np.int8), (0, 255, np.uint8)]
+)
+def test_whole_numbers_come_back(low, high, dtype):
+    space = spaces.Box(low, high, (1,), dtype)
+    actions = np.arange(low, high + 1)[:, None].astype(dtype)
+    scaled = scale_action(actions, space).astype(np.float32)
+    np.testing.assert_array_equal(unscale_action(scaled, space), actions)
+    np.testing.assert_array_equal(
+        within_bounds(np.array([low - 3.0, high - 0.1, high + 3.0]), space), [low, high, high]
+    )
 
 
 @pytest.mark.parametrize(("low", "high", "dtype"), BOUNDS[:3])

@@ -176,6 +176,14 @@ def test_set_parameters_from_a_file(saved, trained):
     assert same(smaller.policy.state_dict(), trained.policy.state_dict())
 
 
+def test_parameters_of_another_kind_of_file_are_said(trained, tmp_path):
+    trained.policy.save(tmp_path / "policy.zip")
+    trained.save_replay_buffer(tmp_path / "replay.pkl")
+    for name in ("policy.zip", "replay.pkl"):
+        with pytest.raises(SavedFileError, match="it holds no agent, which save"):
+            make_sac().set_parameters(tmp_path / name)
+
+
 def test_foreign_files(tmp_path, saved):
     with pytest.raises(FileNotFoundError, match=r"no 'nowhere\.zip'"):
         DelayedSAC.load("nowhere")
@@ -273,6 +281,8 @@ def test_policies_of_another_class_or_kind_are_refused(saved, tmp_path):
 def test_a_device_that_torch_does_not_know_is_no_fault_of_the_file(saved):
     with pytest.raises(RuntimeError, match="gpu"):
         DelayedSAC.load(saved, device="gpu")
+    with pytest.raises(gym.error.NameNotFound, match="NoSuchTask"):
+        DelayedSAC.load(saved, env="NoSuchTask-v0")
 
 
 def test_a_policy_that_cannot_be_written_leaves_the_old_file(tmp_path):

@@ -35,6 +35,11 @@ def test_arguments_come_back(value):
     assert same(from_data(trip(as_data(value, "value"))), value)
 
 
+def test_a_text_of_numpy_is_pythons():
+    given = {"mask": np.random.default_rng(0).choice(["own", "random"])}
+    assert type(given["mask"]) is np.str_ and from_data(trip(as_data(given, "value"))) == {"mask": str(given["mask"])}
+
+
 def test_schedules_and_noise_come_back():
     for schedule in (ConstantSchedule(0.25), LinearSchedule(1e-3, 1e-4, 0.7), FloatSchedule(LinearSchedule(1, 0, 1))):
         loaded = from_data(trip(as_data(schedule, "schedule")))

@@ -19,6 +19,7 @@ from sb3_said import DelayedObservationWrapper
 from sb3_said.delays import UniformDelay
 from sb3_said.offline import BC, Dataset
 from sb3_said.offline.learning import GradientStepBar
+from sb3_said.replay.buffer import DelayedReplayBuffer
 
 DELAY = 3
 
@@ -208,6 +209,50 @@ def test_the_scale_is_the_datasets_and_is_saved(learned, tmp_path):
     np.testing.assert_allclose(normalizer.deviation, data.states.std(0), atol=2e-4)
     learned.save(tmp_path / "bc.zip")
     assert th.equal(BC.load(tmp_path / "bc.zip", device="cpu").policy.state_normalizer.mean, normalizer.mean)
+
+
+def test_weights_keep_the_scale_that_they_learned_with():
+    model, obs = make(), delayed(DELAY).reset(seed=0)[0]
+    model.learn_offline(demonstrations(4), 5)
+    answer = model.predict(obs)[0]
+    data = demonstrations(4)
+    model.take_dataset(replace(data, states=data.states / 5, finals=data.finals / 5))
+    np.testing.assert_array_equal(model.predict(obs)[0], answer)
+
+
+def test_its_policy_answers_with_the_mean_by_itself(learned, tmp_path):
+    obs = delayed(DELAY).reset(seed=0)[0]
+    learned.policy.save(tmp_path / "policy.zip")
+    policy = type(learned.policy).load(tmp_path / "policy.zip", device="cpu")
+    for _ in range(3):
+        np.testing.assert_array_equal(policy.predict(obs)[0], learned.predict(obs)[0])
+
+
+class OfTheUsersOwn(DelayedReplayBuffer):
+    pass
+
+
+def test_logs_go_into_the_buffer_that_was_asked_for():
+    model = make(replay_buffer_class=OfTheUsersOwn, replay_buffer_kwargs={"handle_timeout_termination": False})
+    model.take_dataset(demonstrations(2))
+    assert type(model.replay_buffer) is OfTheUsersOwn and not model.replay_buffer.handle_timeout_termination
+
+
+def test_a_replay_of_logs_is_as_long_as_they_are(tmp_path):
+    model = make()  # of 100 steps
+    model.take_dataset(demonstrations(5))
+    model.save_replay_buffer(tmp_path / "replay")
+    other = make(DummyVecEnv([lambda: delayed(DELAY)] * 2))
+    other.load_replay_buffer(tmp_path / "replay")
+    assert other.replay_buffer.size() == 150 and other.replay_buffer.holds_logs
+    for name in ("observations", "actions", "ages"):
+        np.testing.assert_array_equal(getattr(other.replay_buffer, name), getattr(model.replay_buffer, name))
+    other.learn_offline(None, 2)
+
+
+def test_an_interval_of_the_log_is_a_count():
+    with pytest.raises(ValueError, match="log_interval must be a whole number, at least 1, got 0"):
+        make().learn_offline(demonstrations(2), 2, log_interval=0)
 
 
 def test_it_is_saved_and_loaded(learned, tmp_path):

@@ -11,7 +11,7 @@ from small_task import Drift, delayed
 from test_bc import demonstrations
 from test_bc import make as make_bc
 
-from sb3_said import DelayedSAC
+from sb3_said import DelayedObservationWrapper, DelayedSAC
 from sb3_said.evaluation import rollout
 from sb3_said.offline.belief import (
     BeliefOnly,
@@ -179,14 +179,17 @@ def test_an_actor_is_shown_the_present(source):
     assert len(played.returns) == 3
 
 
-def test_an_actor_of_ours_is_asked_at_age_0(recwarn):
-    actor = DelayedSAC("MlpPolicy", delayed((0, 2)), buffer_size=100, device="cpu", policy_kwargs={"net_arch": [8]})
+@pytest.mark.parametrize("state_history", [False, True])
+def test_an_actor_of_ours_is_asked_at_age_0(state_history, recwarn):
+    env = DelayedObservationWrapper(Drift(), (0, 2), state_history=state_history)
+    actor = DelayedSAC("MlpPolicy", env, buffer_size=100, device="cpu", policy_kwargs={"net_arch": [8]})
     actor.trained_ages = [0]
     obs = delayed(DELAY).reset(seed=0)[0] | {"delay": np.array([2.0]), "action_history": np.full((DELAY, 1), 0.5)}
     agent = BeliefOnly(Truth(), actor)
     action, _ = agent.predict(obs, deterministic=True)
     present = agent.present({key: value[None] for key, value in obs.items()})[0]
     shown = {"observation": present, "action_history": np.zeros((2, 1)), "delay": np.zeros(1)}
+    shown |= {"state_history": np.zeros((2, 2)), "state_known": np.zeros(2)} if state_history else {}
     np.testing.assert_array_equal(action, actor.predict(shown, deterministic=True)[0])
     assert not [w for w in recwarn if "learned at ages" in str(w.message)]
 

@@ -361,6 +361,22 @@ def test_one_number_a_row_may_stand_in_a_column(log, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("box", "actions"),
+    [
+        (spaces.Box(-2.0, 2.0, (1,)), np.linspace(-2, 2, 201)),  # one action needs no column
+        (spaces.Box(-100, 100, (1,), np.int8), np.arange(-100, 101, dtype=np.int8)[:, None]),  # whose span is none
+    ],
+)
+def test_actions_of_one_entry_and_of_whole_numbers(box, actions, tmp_path):
+    states, zeros = np.zeros((201, 3)), np.zeros(201)
+    columns = {"observations": states, "next_observations": states, "rewards": zeros}
+    columns |= {"terminals": zeros > 0, "timeouts": zeros > 0}
+    path = write(tmp_path / "log.npz", columns | {"actions": actions})
+    data = load_dataset(path, STATES, box)
+    np.testing.assert_allclose(data.actions, np.linspace(-1, 1, 201)[:, None], atol=1e-6)
+
+
+@pytest.mark.parametrize(
     ("suffix", "damage"),
     [
         (".npz", lambda content: content[: len(content) // 2]),

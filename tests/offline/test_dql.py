@@ -288,6 +288,10 @@ def test_arguments_of_another_actor_and_other_critics_are_refused(given):
         ({"n_candidates": 0}, "n_candidates is 0, expected at least 1"),
         ({"beta_max": 0.01}, "0 < beta_min < beta_max"),
         ({"time_embedding": 7}, "expected an even number"),
+        ({"max_grad_norm": -1.0}, "max_grad_norm is -1.0, expected a number above 0, or None"),
+        ({"denoising_steps": 2.5}, "denoising_steps is 2.5, expected a whole number"),
+        ({"eta": "1"}, "eta is '1', expected a finite number"),
+        ({"beta_max": np.inf}, "beta_max is inf, expected a finite number"),
     ],
 )
 def test_bad_settings_are_named(setting, message):

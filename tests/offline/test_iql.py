@@ -135,15 +135,22 @@ def test_a_resumed_training_ends_as_one_that_never_stopped():
 @pytest.mark.parametrize(
     ("name", "values", "expected"),
     [
-        ("expectile", (0.4, 1.0, math.nan, "high"), r"0\.5 \(the mean\) up to, not with, 1"),
-        ("learning_rate", (0.0, math.inf, math.nan), "a number above 0"),
-        ("target_rate", (0.0, 1.1), "a number above 0 and at most 1"),
-        ("hidden", (0, 8.0), "a whole number, at least 1"),
-        ("batch_size", (0,), "a whole number, at least 1"),
-        ("updates", (0,), "a whole number, at least 1"),
+        ("expectile", (0.4, 1.0), r"a number from 0\.5, the mean, up to below 1"),
+        ("expectile", (math.nan, "high"), "a finite number"),
+        ("learning_rate", (math.inf, math.nan), "a finite number"),
+        ("hidden", (8.0,), "a whole number"),
+        ("hidden", (0,), "at least 1"),
+        ("batch_size", (0,), "at least 1"),
+        ("updates", (0,), "at least 1"),
     ],
 )
 def test_settings_out_of_range_are_refused(name, values, expected):
     for value in values:
         with pytest.raises(ValueError, match=f"{name} is {value!r}, expected {expected}"):
             IQLConfig(**{name: value})
+
+
+@pytest.mark.parametrize("given", [{"learning_rate": 0.0}, {"target_rate": 0.0}, {"target_rate": 1.1}])
+def test_rates_out_of_range_are_refused(given):
+    with pytest.raises(ValueError, match="expected numbers above 0, the second at most 1"):
+        IQLConfig(**given)

@@ -102,6 +102,25 @@ def test_a_robot_that_stands_until_the_plan_is_there_begins_with_it():
         assert loop.statistics().waiting_steps == 0
 
 
+@pytest.mark.parametrize("n", [0, 1, 3])
+def test_a_simulated_robot_that_waits_begins_with_the_plan_too(n):
+    model = Planning(TASK, 4)
+    loop = in_steps(model, n)
+    for _ in range(2):
+        loop.reset()
+        loop.observe(ZEROS, n_executed=0)
+        assert loop.wait()
+        wanted = plan_of(model.asked[-1], TASK.action_space, 4)
+        assert int(model.asked[-1]["delay"][0]) == 0
+        np.testing.assert_array_equal(loop.act(), wanted[0])
+        loop.observe(ZEROS + 1, n_executed=1)
+        assert loop.wait() and float(model.asked[-1]["observation"][0]) == 1  # whatever the answer is due at
+    assert loop.statistics().waiting_steps == 0
+    loop.close()
+    with pytest.raises(RuntimeError, match="The loop is closed"):
+        loop.wait()
+
+
 def test_threads_that_observe_act_and_answer_at_once_keep_the_books_right():
     """Whatever the interleaving: a model is told what has been and will be sent, and the age that follows from it."""
 

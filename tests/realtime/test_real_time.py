@@ -129,7 +129,7 @@ def test_after_an_interruption_no_question_gets_the_answer_to_another():
             raise KeyboardInterrupt
 
         class Pipe:
-            recv, send_bytes, close = staticmethod(interrupted), model._pipe.send_bytes, model._pipe.close
+            recv, send, close = staticmethod(interrupted), model._pipe.send, model._pipe.close
 
         model._pipe = Pipe()
         with pytest.raises(KeyboardInterrupt):

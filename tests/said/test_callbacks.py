@@ -20,7 +20,6 @@ from sb3_said.planner import InpaintingPlanner
 from sb3_said.planner import trainer as trainer_module
 from sb3_said.planner.first_guess import ROLLED_EACH
 from sb3_said.planner.trainer import GUESS_UPDATES_EACH, PlannerTrainer
-from sb3_said.said import training
 from sb3_said.said.training import PLANNER_CHECKPOINT_NAME
 
 PLANNER = {"d_model": 32, "depth": 1, "horizon": 3, "batch_size": 16, "sampling_steps": 2, "n_candidates": 3}
@@ -377,12 +376,12 @@ def test_the_planners_checkpoints_are_spread_by_time_and_size(tmp_path, monkeypa
     """Ten minutes apart, and 2,000 s apart once the file has a gigabyte; an update takes 100 s."""
     written, now = [], [0.0]
 
-    def save(path, state):
+    def save(path, state, metadata):
         written.append(now[0])
         with open(path, "wb") as file:
             file.truncate(10**9 if now[0] > 1_500 else 10)
 
-    monkeypatch.setattr(training, "save_tree", save)
+    monkeypatch.setattr(checkpoint, "save_tree", save)
     monkeypatch.setattr(checkpoint.time, "monotonic", lambda: now[0])
     model = make().learn(40)
 

@@ -167,6 +167,19 @@ def test_a_training_that_does_not_begin_leaves_a_trained_agent_as_it_was(how, tm
     np.testing.assert_array_equal(answer(model, obs), own)
 
 
+def test_a_training_that_does_not_begin_leaves_the_scale_of_observations_too():
+    env = VecNormalize(DummyVecEnv([delayed]), norm_obs_keys=["observation"])
+    model = make(env).learn(60)
+    before = [rms.copy() for rms in (env.obs_rms["observation"], env.ret_rms)]
+    with pytest.raises(KeyboardInterrupt):
+        model.learn_offline(log(), 4, should_stop=lambda: True)
+    for rms, own in zip((env.obs_rms["observation"], env.ret_rms), before, strict=True):
+        np.testing.assert_array_equal([rms.mean, rms.var], [own.mean, own.var])
+        assert rms.count == own.count
+    model.learn_offline(log(), 4)
+    assert env.obs_rms["observation"].count > before[0].count
+
+
 @pytest.mark.parametrize("n_envs", [1, 2])
 def test_after_logs_it_learns_online_from_steps_of_its_own(n_envs):
     model = learn(make(DummyVecEnv([delayed] * n_envs)))
@@ -224,6 +237,9 @@ def test_an_actor_that_has_learned_nothing_is_not_let_decide(learned, tmp_path):
     learned.save(tmp_path / "agent.zip")
     with pytest.raises(ValueError, match=message):
         SAID.load(tmp_path / "agent.zip", device="cpu", planner_kwargs={"decided_by": "actor"})
+    supplied = {"planner_kwargs": {**learned.planner_kwargs, "decided_by": "actor"}}
+    with pytest.raises(ValueError, match=message):
+        SAID.load(tmp_path / "agent.zip", device="cpu", custom_objects=supplied)
     make().save(tmp_path / "new.zip")  # whose expert may still learn
     loaded = SAID.load(tmp_path / "new.zip", env=delayed(), device="cpu", planner_kwargs={"decided_by": "actor"})
     assert loaded.learn(60).policy.planner.config.decided_by == "actor"

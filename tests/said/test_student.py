@@ -301,3 +301,11 @@ def test_it_is_small_and_reads_no_state_history():
     assert sum(p.numel() for p in student.parameters()) < 100_000
     wider = delayed_space(Drift.observation_space, Drift.action_space, 2, state_history=True)
     assert Student(wider, env.action_space, 8).mean.shape == (5,)
+
+
+@pytest.mark.parametrize(("gradient_steps", "rounds"), [(12, 10), (100, 30), (40, 10), (50, 0)])
+def test_the_student_plays_as_often_as_asked_for(gradient_steps, rounds, pupil, monkeypatch):
+    asked, visited = [], student_module._visited
+    monkeypatch.setattr(student_module, "_visited", lambda *args: (asked.append(args[2]), visited(*args))[1])
+    pupil.distill(**{**QUICK, "own_steps": 60, "gradient_steps": gradient_steps, "rounds": rounds})
+    assert asked == [-(-60 // rounds)] * rounds if rounds else asked == []

@@ -326,6 +326,25 @@ def test_ctrl_c_ends_the_trial_and_not_the_learning(monkeypatch, capsys):
     assert "The trial was interrupted" in capsys.readouterr().out
 
 
+def test_a_trial_whose_rewards_are_no_numbers_chooses_nothing(monkeypatch):
+    class Broken(gym.RewardWrapper):
+        is_broken = False
+
+        def reward(self, reward):
+            return np.nan if self.is_broken else reward
+
+    def play(*args):
+        Broken.is_broken = True  # once the replay, which refuses such a reward, is full
+        return played(*args)
+
+    played = trial._play
+    monkeypatch.setattr(trial, "_play", play)
+    env = DelayedObservationWrapper(Broken(gym.make("Pendulum-v1", max_episode_steps=15)), 2)
+    with pytest.warns(UserWarning, match="trial has failed, and the planner answers as it is: A reward of the trial"):
+        model = make(env=env, planner_trial_episodes=2).learn(60)
+    assert model.policy.who_answers == "planner" and model.policy.planner.config.temperature == 0.5  # as made
+
+
 def test_a_planner_of_one_age_is_not_tried_at_others_and_no_second_one_is_trained():
     with pytest.warns(UserWarning, match="No trial is played, and the planner answers: .*mask='fixed'"):
         model = make(
