@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch as th
 from torch import nn
 
-from sb3_said.replay.windows import Windows
+from sb3_said.replay.windows import Windows, mean_and_deviation
 
 LARGEST_ACTION = 0.999  # the paper's bound before arctanh
 
@@ -49,10 +49,7 @@ class Normalizer(nn.Module):
     def fit(self, states: th.Tensor, actions: th.Tensor) -> None:
         """Take over the mean and standard deviation of states (M, obs_dim) and actions (M, act_dim), float32."""
         for name, values in (("state", states), ("action", self._bend(actions))):
-            variance, mean = th.var_mean(values, dim=0, correction=0)
-            std = variance.sqrt()
-            # Rounding may leave a constant column a tiny deviation, and dividing by it would blow that noise up
-            std[std <= 1e-6 * values.abs().amax(0)] = 1.0
+            mean, std = mean_and_deviation(values)
             getattr(self, f"{name}_mean").copy_(mean)
             getattr(self, f"{name}_std").copy_(std)
 

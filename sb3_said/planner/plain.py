@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch as th
 from torch import nn
 
+from sb3_said.replay.windows import mean_and_deviation
+
 MODEL_WIDTH, MODEL_BLOCKS = 256, 4
 # Standard deviations: a model that is asked far from its data must not run away. A log without noise has falls at 31
 FARTHEST = 100.0
@@ -37,9 +39,9 @@ class ZScored(nn.Module):
     @th.no_grad()
     def scale_to(self, rows: th.Tensor) -> None:
         """Take over how rows (M, n) are spread; an entry that never varies keeps its scale."""
-        std, mean = th.std_mean(rows, dim=0, correction=0)
+        mean, std = mean_and_deviation(rows)
         self.mean.copy_(mean)
-        self.std.copy_(th.where(std > 1e-6, std, 1.0))
+        self.std.copy_(std)
 
     def _z(self, rows: th.Tensor) -> th.Tensor:
         return (rows - self.mean) / self.std

@@ -30,6 +30,11 @@ class Prior(nn.Module):
         self.register_buffer("slope", th.zeros(max_delay + 1, length, n_entries))
         self.register_buffer("std", th.ones(max_delay + 1, length, n_entries))
 
+    @property
+    def is_fitted(self) -> bool:
+        """Whether :meth:`fit` has been called."""
+        return bool((self.std != 1).any())
+
     @th.no_grad()
     def fit(self, delay: int, guess: th.Tensor, clean: th.Tensor, valid: th.Tensor) -> None:
         """Learn by least squares how far guesses of one delay are right.

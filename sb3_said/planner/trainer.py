@@ -110,7 +110,6 @@ class PlannerTrainer:
         self.config = planner.config
         self.gradient_steps = gradient_steps
         self.n_updates = 0
-        self._has_guessed = False
         self.device = planner.device
         on_gpu = self.device.type == "cuda"
         self.generator = th.Generator(self.device if on_gpu else "cpu").manual_seed(seed)
@@ -189,8 +188,10 @@ class PlannerTrainer:
         :return: whether there is one, or none is asked for; False where ``should_stop`` has ended it
         """
         guess, older, self.older = self.online.first_guess, self.older, None  # older: another copy of the replay
-        if guess is None or self.n_updates > 0 or self._has_guessed:
+        prior = self.online.prior
+        if guess is None or prior is None or self.n_updates > 0 or prior.is_fitted:
             return True
+        guess.requires_grad_(True)  # which one that was taken back has not
         passes = -(-GUESS_PASSES * len(self.source) // GUESS_BATCH_SIZE)
         n_updates = min(GUESS_UPDATES, GUESS_UPDATES_EACH * self.gradient_steps, passes)
         if not fit_first_guess(
@@ -224,7 +225,6 @@ class PlannerTrainer:
         self.online.first_guess.requires_grad_(False)
         self.online.fit_prior(self.source.sample(N_PRIOR_WINDOWS, self.online.window_length, self.generator))
         self.average.load_state_dict(self.online.state_dict())
-        self._has_guessed = True
 
     def _descend(self) -> tuple[th.Tensor]:
         """Draw a batch, move both sets of weights, and return both losses, (2,), without waiting for the device."""

@@ -29,6 +29,16 @@ class Windows(NamedTuple):
         return Windows(*(part.to(device) for part in self))
 
 
+def mean_and_deviation(rows: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """Return both of rows (M, n): (n,) each, a deviation of 1 for entries that vary by no more than rounding.
+
+    To divide by the tiny deviation that rounding may leave a constant entry would blow that noise up.
+    """
+    variance, mean = th.var_mean(rows, dim=0, correction=0)  # a mean alone is off where an entry never moves
+    deviation = variance.sqrt()
+    return mean, th.where(deviation <= 1e-6 * rows.abs().amax(0), 1.0, deviation)
+
+
 @dataclass(frozen=True)
 class WindowSource:
     """Every place a window can start, over arrays that are shared and, but by :meth:`to`, never copied.

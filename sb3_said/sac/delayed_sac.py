@@ -33,7 +33,7 @@ from sb3_said.files.agents import SafeSaveMixin, existing, with_suffix
 from sb3_said.files.archive import load_tree, readable, save_tree
 from sb3_said.files.checks import RANGES, check_range
 from sb3_said.replay.buffer import DelayedReplayBuffer
-from sb3_said.sac.policies import DelayedSACPolicy, as_array
+from sb3_said.sac.policies import SERVED, DelayedSACPolicy, as_array
 
 
 class DelayedSAC(SafeSaveMixin, SAC):
@@ -127,6 +127,10 @@ class DelayedSAC(SafeSaveMixin, SAC):
         own, given = {*self._policy_flags(), "relabelled_ages"}, {*self.policy_kwargs, *self.replay_buffer_kwargs}
         if twice := sorted(own & given):
             raise ValueError(f"Give {', '.join(twice)} to {name} itself, not in policy_kwargs or replay_buffer_kwargs.")
+        if unserved := sorted({*SERVED} & {*self.policy_kwargs}):
+            raise ValueError(
+                f"{name} does not serve {', '.join(unserved)} of policy_kwargs; leave it out, or take StableSAC."
+            )
         if self.env is not None:
             self._check_env(self.env)
         if self.replay_buffer is None:
@@ -202,13 +206,13 @@ class DelayedSAC(SafeSaveMixin, SAC):
     def _steps_counted(self) -> list[tuple[int, int]] | None:
         """Return what SB3's ``Monitor`` has counted of each environment, in all and in this episode.
 
-        None without Monitors, and where an episode has no step yet: they do not tell one reset from another.
+        None without Monitors, and where no episode has a step yet: they do not tell one reset from another.
         """
         assert self.env is not None
         if not all(_are_wrapped(self.env, Monitor)):
             return None
         in_episode = [len(rewards) for rewards in self.env.get_attr("rewards")]
-        return [*zip(self.env.get_attr("total_steps"), in_episode, strict=True)] if all(in_episode) else None
+        return [*zip(self.env.get_attr("total_steps"), in_episode, strict=True)] if any(in_episode) else None
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
         """Collect as SB3 does, which does not store the step at which a callback ends training, or an exception.
@@ -348,15 +352,18 @@ class DelayedSAC(SafeSaveMixin, SAC):
                 self.check_ages(sorted({int(age) for age in ages[history[:, 0].any(1)]}))
         return answer
 
-    def _new_replay_buffer(self) -> DelayedReplayBuffer:
-        """Return an empty replay of this agent's size and environments."""
+    def _new_replay_buffer(self, size: int | None = None, n_envs: int | None = None) -> DelayedReplayBuffer:
+        """Return an empty replay of this agent's environments.
+
+        :param size: rows, ``buffer_size`` by default
+        """
         made: Any = self.replay_buffer_class  # as _setup_model saw to
         return made(
-            self.buffer_size,
+            self.buffer_size if size is None else size,
             self.observation_space,
             self.action_space,
             self.device,
-            self.n_envs,
+            self.n_envs if n_envs is None else n_envs,
             self.optimize_memory_usage,
             relabelled_ages=self.relabelled_ages,
             **self.replay_buffer_kwargs,
@@ -379,11 +386,12 @@ class DelayedSAC(SafeSaveMixin, SAC):
         """
         found = existing(path, ".pkl")  # type: ignore[arg-type]  # io.BufferedIOBase is IO
         state = load_tree(found)
-        if self.replay_buffer is None:
-            self.replay_buffer = self._new_replay_buffer()
+        replay = self._new_replay_buffer() if self.replay_buffer is None else self.replay_buffer
         with readable(found, explained=(ValueError,)):
-            self.replay_buffer.load_state_dict(state)
-        self.replay_buffer.device = self.device
+            if state["holds_logs"] is True:  # however long they are
+                replay = self._new_replay_buffer(len(state["rewards"]) + 1, n_envs=1)
+            replay.load_state_dict(state)
+        self.replay_buffer, replay.device = replay, self.device
 
 
 def _is_delayed(env: Any) -> bool:

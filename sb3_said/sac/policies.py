@@ -32,6 +32,10 @@ NOT_FINITE = (
     "damaged, or its training diverged."
 )
 
+#: Arguments of the policy that an algorithm has to serve, as it learns
+SERVED = ("normalise_states", "scale_rewards", "average_actor")
+OWN_ARGUMENTS = ("augment_state", "delay_reconciled_critic", "critic_layer_norm", *SERVED)
+
 
 class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
     """SAC's policy for delayed observations; for a plain 1-D Box it computes what SB3's ``SACPolicy`` does.
@@ -229,15 +233,7 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
             raise ValueError(NOT_FINITE) from error
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {
-            **super()._get_constructor_parameters(),
-            "augment_state": self.augment_state,
-            "delay_reconciled_critic": self.delay_reconciled_critic,
-            "normalise_states": self.normalise_states,
-            "scale_rewards": self.scale_rewards,
-            "average_actor": self.average_actor,
-            "critic_layer_norm": self.critic_layer_norm,
-        }
+        return super()._get_constructor_parameters() | {name: getattr(self, name) for name in OWN_ARGUMENTS}
 
 
 def each_part(change: Callable[[th.Tensor], th.Tensor], observation: PyTorchObs) -> PyTorchObs:

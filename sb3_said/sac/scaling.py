@@ -8,8 +8,9 @@ import numpy as np
 import torch as th
 from torch import nn
 
+from sb3_said.replay.windows import mean_and_deviation
+
 LARGEST_SCALED_RETURN = 5.0  # of SimbaV2: the returns that its critic can tell apart end there
-SMALLEST_DEVIATION = 1e-4  # of a state's entry, in its own units
 LARGEST_SCORE = 10.0  # of SB3's VecNormalize
 
 
@@ -80,9 +81,9 @@ class StateNormalizer(OnTheHost):
 
     def fit(self, states: th.Tensor, n_steps: int) -> None:
         """Take mean and standard deviation of states, (N, obs_dim), which were replayed at this environment step."""
-        variance, mean = th.var_mean(states, dim=0, correction=0)  # a mean alone is off where an entry never moves
+        mean, deviation = mean_and_deviation(states)
         self.mean.copy_(mean)
-        self.deviation.copy_(variance.sqrt() + SMALLEST_DEVIATION)
+        self.deviation.copy_(deviation)
         self.fitted_at.fill_(float(n_steps))
 
     def forward(self, states: th.Tensor) -> th.Tensor:

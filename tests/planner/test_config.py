@@ -3,6 +3,7 @@
 import dataclasses
 import json
 
+import numpy as np
 import pytest
 
 from sb3_said.planner import PlannerConfig
@@ -18,6 +19,12 @@ def test_paper_config_is_the_papers_table():
     expected |= {"early_probability": 0.0, "first_guess": "none"}
     assert expected.items() <= dataclasses.asdict(config).items()
     assert PlannerConfig.paper(sampling_steps=2).sampling_steps == 2
+
+
+def test_numbers_and_texts_of_numpy_are_pythons():
+    config = PlannerConfig(horizon=np.int64(8), temperature=np.float32(0.5), mask=np.str_("own"))
+    assert PlannerConfig(**json.loads(json.dumps(config.to_dict()))) == config
+    assert config == PlannerConfig(horizon=8, temperature=0.5, mask="own")
 
 
 def test_settings_of_sampling_do_not_decide_the_weights():

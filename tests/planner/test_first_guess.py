@@ -186,6 +186,21 @@ def test_a_training_with_it_resumes_bit_for_bit():
         make_trainer(first_guess="none").load_state_dict(first.state_dict())
 
 
+def test_a_training_whose_guess_is_made_goes_on_with_it():
+    whole, other, made = make_trainer(2), make_trainer(2), make_trainer(2)
+    before = whole.state_dict()
+    whole.make_first_guess()
+    other.load_state_dict(whole.state_dict())
+    for each in (whole, other):
+        each.train()
+    for name, weight in other.average.state_dict().items():
+        assert th.equal(weight, whole.average.state_dict()[name]), name
+    made.make_first_guess()
+    made.load_state_dict(before)  # of one that has none
+    made.train()
+    assert made.average.prior.is_fitted
+
+
 def test_it_is_made_once_and_then_stays():
     trainer = make_trainer()
     trainer.step()

@@ -11,6 +11,7 @@ from small_task import Drift, delayed
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_said import DelayedSAC, StableSAC
@@ -154,6 +155,18 @@ def test_a_reset_between_two_calls_is_seen_at_the_start_of_an_episode_too(monkey
     model.get_env().reset()
     model.learn(12, reset_num_timesteps=False)
     assert_replay_is_what_happened(model, rows)
+
+
+def test_a_long_episode_goes_on_beside_one_that_begins():
+    model = make(DummyVecEnv([(lambda n=n: Monitor(Drift(length=n))) for n in (5, 7, 200)]), learning_starts=10**6)
+    for _ in range(20):
+        model.learn(5 * 3, reset_num_timesteps=False)  # the first begins an episode each time
+    replay = model.replay_buffer
+    assert replay.steps.max(0).tolist() == [4, 6, 99]
+    assert np.array_equal(replay.ends[:99], replay.dones[:99] == 1)  # none was cut
+    model.env.reset()
+    model.learn(5 * 3, reset_num_timesteps=False)
+    assert replay.steps[100].tolist() == [0, 0, 0]
 
 
 @pytest.mark.parametrize("rewards", [0.0, ("a", "b")])

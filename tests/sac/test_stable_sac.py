@@ -24,6 +24,7 @@ from torch.nn import functional as F
 from sb3_said import SAID, DelayedSAC, StableSAC
 from sb3_said.delays.space import UNDELAYED
 from sb3_said.files.archive import SavedFileError
+from sb3_said.planner.plain import ZScored
 from sb3_said.sac.scaling import ReturnScale, StateNormalizer
 
 AS_SADR = {
@@ -72,6 +73,18 @@ def test_states_are_scored():
     np.testing.assert_allclose(scores.mean(0), 0.0, atol=1e-4)
     np.testing.assert_allclose(scores.std(0, correction=0), [1, 1, 0], atol=1e-3)
     assert normalizer(th.full((1, 3), 1e6)).max() == 10  # an entry that never moved, and then does
+
+
+@pytest.mark.parametrize("unit", [1e-7, 1e7])
+@pytest.mark.parametrize("scale", [StateNormalizer, ZScored])
+def test_the_unit_of_a_state_does_not_matter(scale, unit):
+    def scores(states):
+        made = scale(2)
+        made.fit(states, 0) if scale is StateNormalizer else made.scale_to(states)
+        return made(states) if scale is StateNormalizer else made._z(states)
+
+    states = th.randn(500, 2) + 3
+    th.testing.assert_close(scores(unit * states), scores(states), rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("constant", [1000.1, 12345.678, -3e-3])
