@@ -24,7 +24,7 @@ one by one, so that they do not depend on the number of environments.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -33,6 +33,7 @@ import numpy as np
 import torch as th
 from measure import matmul_rates, parse, parser, percentiles, print_table, progress, ratio, turn_by_turn, write_json
 from plain import PlainPlanner
+from scipy.stats import linregress
 from stable_baselines3 import SAC
 
 from sb3_said import SAID, DelayedObservationWrapper
@@ -193,17 +194,6 @@ def measure_setting(setting: Setting, rounds: int, device: str, rates: dict[str,
     }
 
 
-def fit_line(x: Sequence[float], y: Sequence[float]) -> dict[str, float]:
-    """Return intercept, slope and the share of variance that the line of least squares explains."""
-    slope, intercept = np.polyfit(x, y, 1)
-    residual = np.asarray(y) - (intercept + slope * np.asarray(x))
-    return {
-        "intercept": float(intercept),
-        "slope": float(slope),
-        "R2": float(1 - residual @ residual / np.square(y - np.mean(y)).sum()),
-    }
-
-
 def measure_scaling(base: Setting, rounds: int, device: str) -> list[dict[str, Any]]:
     """Time decisions of several sizes in turn, and return a row for each kind of size with its line."""
     model = make_agent(base, device)
@@ -230,14 +220,14 @@ def measure_scaling(base: Setting, rounds: int, device: str) -> list[dict[str, A
         progress(f"{rounds} turns of one decision by {kind}: {', '.join(map(str, variants))}")
         seconds = turn_by_turn({str(size): variant for size, variant in variants.items()}, rounds, device)
         medians = [1e3 * float(np.median(seconds[str(size)])) for size in variants]
-        line = fit_line(list(variants), medians)
+        line = linregress(list(variants), medians)
         rows.append(
             {
                 "p50 in ms by": kind,
                 "at": ", ".join(f"{size}: {ms:.2f}" for size, ms in zip(variants, medians, strict=True)),
-                "intercept": line["intercept"],
-                "slope": line["slope"],
-                "R2": f"{line['R2']:.4f}",
+                "intercept": float(line.intercept),
+                "slope": float(line.slope),
+                "R2": f"{line.rvalue**2:.4f}",
             }
         )
     return rows

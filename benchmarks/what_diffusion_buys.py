@@ -60,6 +60,8 @@ from sb3_said.planner import InpaintingPlanner
 from sb3_said.planner.inpainting import newest
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.said.ways import WAYS
+from sb3_said.zoo.answer import BEST_NAME, EXPERT_FOLDER
+from sb3_said.zoo.record import Record
 
 EXPERT = ("expert, last", "expert, average")
 NETWORKS = ("cloning", "regressed present", "inpainted present", "guessed present", GUESS_ALONE)
@@ -134,8 +136,8 @@ def open_run(folder: Path, device: str = "cpu") -> SAID:
 
     :raises ValueError: for a folder without a checkpoint or a saved SAID agent
     """
-    agents = [*folder.glob("*-v*.zip"), *folder.glob("expert/best_model.zip")]
-    agents = [file for file in agents if not file.name.endswith(".normalize.zip")]
+    own, best = folder / Record.read(folder).agent_name, folder / EXPERT_FOLDER / BEST_NAME
+    agents = [file for file in (own, best) if file.is_file()]
     if not agents or not (folder / CHECKPOINT_NAME).is_file():
         raise ValueError(f"{folder} has no {CHECKPOINT_NAME}, or no saved agent beside it; give a run of --algo said.")
     run = load_agent(agents[0], device)

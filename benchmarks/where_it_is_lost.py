@@ -153,9 +153,7 @@ class Held(Player):
         self.n_held, self.left = n_held, [th.empty(0)]
 
     @th.no_grad()
-    def predict(
-        self, observation: dict[str, np.ndarray], state: Any = None, episode_start: Any = None, **_: Any
-    ) -> tuple[np.ndarray, Any]:
+    def predict(self, observation: dict[str, np.ndarray], state: Any = None, **_: Any) -> tuple[np.ndarray, Any]:
         if len(self.left[0]) != len(observation["observation"]):  # an episode has ended
             self.left = [th.empty(0)]
         return super().predict(observation, state)

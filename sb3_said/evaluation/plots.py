@@ -126,7 +126,7 @@ def plot_learning_curve(run: str | Path, ax: Axes | None = None, window: int = 2
             value, low, high = _bounds([confidence_interval(row) for row in results])
             ax.plot(eval_steps, value, color=color, marker="o", markersize=3, label=f"{name}, 95 % interval")
             ax.fill_between(eval_steps, low, high, color=color, alpha=0.2, linewidth=0)
-    ax.set_xlabel("environment steps")
+    ax.set_xlabel("environment steps" if len(steps) else "training steps")  # of logs, gradient steps
     ax.set_ylabel("return of an episode (undiscounted)")
     ax.legend(frameon=False)
     return ax

@@ -206,11 +206,11 @@ def _monitored(env: gym.Env[Any, Any], counted: float) -> float:
 
 
 def _half_range(space: gym.Space[Any]) -> np.ndarray:
-    """Return half the distance of a Box's bounds, and 1 where an action has none."""
+    """Return half the distance of a Box's bounds, and 1 where there is none or no end to it."""
     if not isinstance(space, gym.spaces.Box):
         return np.ones(())
     half = space.high.astype(np.float64) / 2 - space.low.astype(np.float64) / 2
-    return np.where(np.isfinite(half), half, 1.0)
+    return np.where(np.isfinite(half) & (half > 0), half, 1.0)
 
 
 def _row(observations: Observation, row: int) -> Observation:

@@ -173,7 +173,8 @@ def confidence_interval(
     from scipy.stats import DegenerateDataWarning, bootstrap  # a second, which a command's --help can do without
 
     method = "BCa bootstrap"
-    settings = {"statistic": of_units, "confidence_level": confidence, "vectorized": True}
+    # In parts, as all samples together take gigabytes
+    settings = {"statistic": of_units, "confidence_level": confidence, "vectorized": True, "batch": 500}
     with warnings.catch_warnings(), np.errstate(divide="ignore", invalid="ignore"):
         warnings.simplefilter("ignore", DegenerateDataWarning)
         found = bootstrap((everyone,), n_resamples=n_resamples, rng=np.random.default_rng(seed), **settings)

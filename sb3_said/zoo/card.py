@@ -119,7 +119,7 @@ def make_card(
         model_name=type(run.model).__name__,
         eval_results=[result],
     )
-    text = describe(run, record, results, cells, answered, latency_ms, n_trial_steps)
+    text = describe(run, record, results, cells, latency_ms, n_trial_steps)
     title = f"{type(run.model).__name__} on {env_id} under observation delay"
     return ModelCard.from_template(data, template_str=TEMPLATE, title=title, text=text)
 
@@ -129,7 +129,6 @@ def describe(
     record: Record,
     results: Results,
     cells: list[Cell],
-    answered: list[Cell],
     latency_ms: float | None,
     n_trial_steps: int,
 ) -> str:
@@ -142,6 +141,7 @@ def describe(
     facts: dict[str, Any] = {
         "ages trained on": written_ages(ages_trained_on(run, record)) + " control steps",
         "largest age it reads": f"{longest_delay(run.model) or 0} control steps",
+        **({"task changed by": run.setting} if run.changes else {}),
         "control period": "unknown" if period is None else f"{1000 * period:g} ms",
         "who answers": who_answers(run.model),
         steps: f"{run.model.num_timesteps:,}"
@@ -152,12 +152,16 @@ def describe(
         **({} if run.normalize is None else {"belongs beside it": f"`{normalization_file(file).name}`"}),
         "median decision": "not measured" if latency_ms is None else f"{latency_ms:g} ms, one CPU thread",
     }
+    task = f"--delay {longest_delay(run.model) or 0}" + "".join(f" --gym-packages {x}" for x in record.gym_packages)
+    shows = f"`sb3-said enjoy {file.name} {task} --record video.mp4` shows it."
+    if run.changes:
+        shows = "It plays right in its run's folder, or in an environment of yours with the changes below."
     lines = [
         "```python",
         *use(run),
         "```",
         "",
-        f"`sb3-said enjoy {file.name} --delay {longest_delay(run.model) or 0} --record video.mp4` shows it.",
+        shows,
         "",
         "| | |",
         "|---|---|",
@@ -195,8 +199,8 @@ def use(run: LoadedRun) -> list[str]:
 
 
 def ages_trained_on(run: LoadedRun, record: Record) -> list[int]:
-    """Return the ages that an agent has met; a planner of logs has drawn them all."""
-    if isinstance(run.model, SAID) and record.dataset:
+    """Return the ages that an agent has met; a planner has drawn them all, where its expert or logs had others."""
+    if isinstance(run.model, SAID) and (record.dataset or record.expert_delay is not None):
         return [*range(run.model.policy.max_delay + 1)]
     return run.model.trained_ages or []  # type: ignore[attr-defined]  # all of ours have them
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -56,7 +57,7 @@ class Cell:
     @property
     def lineage(self) -> tuple[str, str]:
         """The file and the label: an agent of both, but of other contents, is an earlier state of this one."""
-        return self.file, self.agent.removesuffix(f" {self.answer}")
+        return os.path.abspath(self.file), self.agent.removesuffix(f" {self.answer}")
 
     @property
     def column(self) -> int | str:

@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import json
 import math
+import os
 import sys
 import zipfile
 from collections.abc import Callable, Iterator
@@ -181,9 +182,10 @@ def main(argv: list[str] | None = None) -> None:
         with tqdm(total=args.steps, unit="step") as bar:
             for i, share in enumerate(shares):
                 n_steps = args.steps * (i + 1) // len(shares) - args.steps * i // len(shares)
-                first = unused.get((share.name, share.noise), args.seed)  # else the same steps came again
+                who = os.path.abspath(share.name), share.noise  # a path may be given in two ways
+                first = unused.get(who, args.seed)  # else the same steps came again
                 parts.append(play(share, n_steps, first, args.n_envs, not args.stochastic, bar))
-                unused[share.name, share.noise] = 1 + max(episode.seed for episode in parts[-1])
+                unused[who] = 1 + max(episode.seed for episode in parts[-1])
         run = shares[0].run
         told = [describe(share, part) for share, part in zip(shares, parts, strict=True)]
         about = json.dumps({**origin(run), "seed": args.seed, "changes": json.loads(run.setting), "shares": told})

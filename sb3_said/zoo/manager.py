@@ -146,8 +146,10 @@ class DelayedExperimentManager(ExperimentManager):
             self.lock = hold_folder(run.resume)  # once nothing can fail: who has no manager cannot let go of it
             self._set_folder(run.resume)
             self.custom_hyperparams = with_given(run.record.hyperparams, given, NESTED)
-            self.env_kwargs = {**run.record.env_kwargs, **self.env_kwargs}
-            self.eval_env_kwargs = {**run.record.eval_env_kwargs, **self.eval_env_kwargs}
+            given_env, self.env_kwargs = self.env_kwargs, {**run.record.env_kwargs, **self.env_kwargs}
+            as_training = run.record.eval_env_kwargs == run.record.env_kwargs
+            given_eval = self._eval_env_kwargs_args or (given_env if as_training else {})
+            self.eval_env_kwargs = {**run.record.eval_env_kwargs, **given_eval}
         else:
             overrides = preset_overrides(self.config, run.preset, env_id, run.delay, run.max_delay, run.dataset)
             if (
@@ -197,9 +199,17 @@ class DelayedExperimentManager(ExperimentManager):
                 f"{', '.join(refused)} wraps all environments at once, and no command could play the agent: put "
                 "gymnasium.wrappers.FrameStackObservation and FlattenObservation into env_wrapper, or yours."
             )
+        if "gymnasium.wrappers.Normalize" in str(self._own_wrappers):
+            raise ValueError(
+                "gymnasium.wrappers.NormalizeObservation and NormalizeReward keep statistics that no file holds, and "
+                "each evaluation has others: take -params \"normalize:dict(norm_obs_keys=['observation'])\"."
+            )
         made = super()._preprocess_hyperparams(hyperparams)
         if self.n_envs < 1:
             raise ValueError(f"n_envs must be at least 1, got {self.n_envs}.")
+        before = self.n_envs if self.run.record is None else self.run.record.hyperparams.get("n_envs", 1)
+        if self.n_envs != before and not self.run.dataset:
+            raise ValueError(f"--resume goes on with n_envs={before}, as the replay has them, got {self.n_envs}.")
         if self._eval_env_kwargs_args is None and self.run.record is None:
             self.eval_env_kwargs = self.env_kwargs
         return made

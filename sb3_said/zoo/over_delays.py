@@ -91,6 +91,7 @@ def main(argv: list[str] | None = None) -> None:
         if unused and not args.runs:
             raise ValueError(f"--{', --'.join(unused)}: without runs to play this has no effect; leave it out.")
         shown = play_missing(args, delays) if args.runs else known_cells(args, delays)
+        shown = [replace(cell, delay=named.setdefault(repr(make_process(cell.delay)), cell.delay)) for cell in shown]
         rows = choose_rows(args.rows, shown)
     table = make_table(shown, rows)
     order = delays or list(dict.fromkeys(cell.delay for cell in shown))

@@ -68,7 +68,8 @@ def preset_overrides(
     if preset not in presets:
         raise ValueError(f"{config} has no preset '{preset}', only {[*presets]}.")
     suited = document.get("by_dataset", {}).get(env_id, {}).get(kind, {})
-    overrides = {**suited, **presets[preset].get(env_id, presets[preset]["default"])}
+    blocks = presets[preset] or {}
+    overrides = {**suited, **(blocks.get(env_id, blocks.get("default")) or {})}
     by_kind = overrides.pop("planner_by_dataset", {}).get(kind, {})
     by_delay = {**overrides.pop("planner_by_delay", {}), **by_kind}
     planner = dict(overrides.get("planner_kwargs", {}))

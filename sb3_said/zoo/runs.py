@@ -36,7 +36,7 @@ from sb3_said.files.normalization import load_normalization, normalization_file
 from sb3_said.said.policies import Answer
 from sb3_said.zoo.arguments import Delay, largest_delay
 from sb3_said.zoo.folder import find_agent, find_normalization
-from sb3_said.zoo.manager import ALGORITHMS, OF_ALL_ENVIRONMENTS
+from sb3_said.zoo.manager import ALGORITHMS
 from sb3_said.zoo.record import WRAPPER, Record, import_packages, make_wrapper
 
 ANSWERS = get_args(Answer)
@@ -127,9 +127,6 @@ def load_run(
     algo, env_id = str(own_algo or algo), env_id or own_task
     if env_id is None:
         raise ValueError(f"The task of {file} is not known: no run folder is around it, and it names none. Give --env.")
-    for key in OF_ALL_ENVIRONMENTS:
-        if hyperparams.get(key):
-            raise ValueError(f"{file} was trained with {key}={hyperparams[key]}, which cannot be played here.")
 
     if record is not None:
         record.require("env_wrapper", "env_kwargs")

@@ -69,12 +69,6 @@ def test_every_setting_is_timed_with_a_first_guess_too():
     assert [config.present for config in guessing] == ["inpainted"] * 2 + ["guessed"] * 3
 
 
-def test_line_through_points():
-    line = plan_latency.fit_line([1, 2, 3, 4], [5.0, 7.0, 9.0, 11.0])
-    assert line == pytest.approx({"intercept": 3.0, "slope": 2.0, "R2": 1.0})
-    assert plan_latency.fit_line([1, 2, 3, 4], [1.0, -1.0, 1.0, -1.0])["R2"] < 0.3
-
-
 def test_quick_run_writes_what_it_prints(tmp_path, capsys):
     threads = th.get_num_threads()
     products = ["--product-size", "64", "--product-seconds", "0"]

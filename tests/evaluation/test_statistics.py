@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from typing import Any
 
 import numpy as np
@@ -207,3 +208,12 @@ def test_a_stratified_interval_has_the_spread_of_seeds_and_of_their_episodes() -
 def test_a_stratified_interval_needs_seeds_and_their_episodes(returns: Any) -> None:
     with pytest.raises(ValueError, match="shape"):
         stratified_interval(returns)
+
+
+def test_an_interval_of_many_episodes_takes_no_gigabytes() -> None:
+    values = np.random.default_rng(0).normal(size=4_000)
+    tracemalloc.start()
+    found = confidence_interval(values, n_resamples=1_000)
+    largest = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert largest < 100e6 and found.low < found.value < found.high  # at once: 560 MB

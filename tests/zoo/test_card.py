@@ -7,7 +7,7 @@ import shlex
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -108,7 +108,7 @@ def test_an_agent_of_normalised_observations_says_how_to_read_them(
     folder = train_run(tmp_path, "sadr", "normalize:dict(norm_obs_keys=['observation'])")
     played = load_run(folder, device="cpu")
     results: Any = SimpleNamespace(settings={"n_episodes": 1, "seed": 0})
-    facts = card.describe(played, Record.read(folder), results, [], [], None, 0)
+    facts = card.describe(played, Record.read(folder), results, [], None, 0)
     assert f"| belongs beside it | `{ENV}.normalize.zip` |" in facts
     code, env = facts.split("```")[1].removeprefix("python\n"), played.make_env()
     names: dict[str, Any] = {"make_env": played.make_env, "observation": env.reset(seed=3)[0]}
@@ -132,8 +132,21 @@ def test_an_agent_of_logs_has_met_all_ages_of_its_delay(run: Path) -> None:
     assert card.ages_trained_on(played, record) == [0, 1, 2]
     assert card.ages_trained_on(played, replace(record, dataset=[])) == model.trained_ages
     results: Any = SimpleNamespace(settings={"n_episodes": 1, "seed": 0})
-    facts = card.describe(played, record, results, [], [], None, 0)
+    facts = card.describe(played, record, results, [], None, 0)
     assert "| gradient steps, on logs | 60 |" in facts
+    other = replace(record, dataset=[], expert_delay=0)  # whose planner has drawn them all
+    assert card.ages_trained_on(played, other) == [0, 1, 2]
+
+
+def test_the_card_says_what_plays_an_agent_of_a_task_of_ones_own(run: Path) -> None:
+    played, results = load_run(run, device="cpu"), cast(Any, SimpleNamespace(settings={"n_episodes": 1, "seed": 0}))
+    record = Record("said", ENV, 3, 2, gym_packages=["mine"])
+    assert "--delay 2 --gym-packages mine --record video.mp4` shows it." in card.describe(
+        played, record, results, [], None, 0
+    )
+    played.changes["env_kwargs"] = {"g": 1.0}
+    text = card.describe(played, record, results, [], None, 0)
+    assert "| task changed by |" in text and "'g': 1.0" in text.replace('"', "'") and "shows it" not in text
 
 
 def test_the_card_says_how_candidates_decide(run: Path) -> None:

@@ -96,11 +96,11 @@ def test_shares_are_equal_repeatable_and_cut_where_they_are_full(
 
 
 def test_an_agent_that_plays_twice_plays_on_and_not_the_same_again(run: Path, tmp_path: Path) -> None:
-    words = (run, run, "random", "--noise", "0", "0.5", "--steps", "240", "--seed", "5")
+    words = (run, f"{run}/", "random", "--noise", "0", "0.5", "--steps", "240", "--seed", "5")
     data = collected(tmp_path / "a.npz", *words)
     starts = data.states[np.append(0, np.flatnonzero(data.ends)[:-1] + 1)]
     about = json.loads(str(np.load(tmp_path / "a.npz")["about"]))
-    shares = [(share["agent"], share["noise"]) for share in about["shares"]]
+    shares = [(share["agent"].rstrip("/"), share["noise"]) for share in about["shares"]]
     first = np.cumsum([0, *(share["episodes"] for share in about["shares"])])
     drawn: dict[Any, list[Any]] = {}
     for share, left, right in zip(shares, first[:-1], first[1:], strict=True):

@@ -186,6 +186,11 @@ def test_without_runs_what_was_played_is_shown(
             assert row[column].startswith(f"{np.mean(cells[agent, delay]['returns']):.1f} [")
     assert plot.read_bytes()[:4] == b"\x89PNG"
     assert show("--rows", "one=a short name")[2][0] == "a short name"
+    two = json.loads(written)  # played by two commands, which wrote the process in two ways
+    next(cell for cell in two["cells"] if cell["delay"] == "UniformDelay(0, 1)")["delay"] = "UniformDelay(0,1)"
+    file.write_text(json.dumps(two))
+    assert len(show()[0]) == len(show("--delays", "0", "UniformDelay(0, 1)", "1", "2")[0])
+    file.write_bytes(written)
     play(file, runs, ["0", "1"], "--rows", "again")
     assert not played  # an agent under two labels is known under both
     assert file.read_bytes() != written and by_cell(json.loads(file.read_text())) == cells
@@ -245,6 +250,10 @@ def test_a_changed_agent_is_played_again(said: Path, tmp_path: Path, monkeypatch
         [(f"a {w}", d) for w in ("expert", "planner") for d in (0, 1)] + [("b", 1)]
     )
     assert by_cell(new)["b", 1] != by_cell(old)["b", 1]
+    monkeypatch.chdir(tmp_path)
+    write_run(folder, DelayedSAC, 1, seed=6)
+    again = play(file, ["b=d1"], ["1"])  # the same by another path
+    assert "1 results of b are dropped: " in capsys.readouterr().out and [*by_cell(again)].count(("b", 1)) == 1
     assert by_cell(new)["a expert", 0] == by_cell(old)["a expert", 0]
 
 

@@ -170,6 +170,13 @@ def test_a_file_of_ones_own_may_name_no_preset(tmp_path: Path) -> None:
     assert preset_overrides(tmp_path / "own.yml", "cpu", "Hopper-v5", 4) == {}
 
 
+@pytest.mark.parametrize("default", ["", "    default:\n"])
+def test_a_preset_of_ones_own_may_be_of_one_task(default: str, tmp_path: Path) -> None:
+    (tmp_path / "own.yml").write_text(f"presets:\n  fast:\n    Hopper-v5: {{n_timesteps: 7}}\n{default}")
+    assert preset_overrides(tmp_path / "own.yml", "fast", "Hopper-v5", 4) == {"n_timesteps": 7}
+    assert preset_overrides(tmp_path / "own.yml", "fast", "Ant-v5", 4) == {}
+
+
 def test_an_unknown_preset_is_named() -> None:
     with pytest.raises(ValueError, match="no preset 'fast'"):
         preset_overrides(config_file("said"), "fast", "Hopper-v5", 4)

@@ -25,6 +25,7 @@ from trained_run import NETWORKS, train_here
 
 from sb3_said import SAID, DelayedSAC
 from sb3_said.delays.space import ages_of
+from sb3_said.files import checkpoint
 from sb3_said.files.archive import load_tree
 from sb3_said.files.checkpoint import TrainingCheckpointCallback
 from sb3_said.planner.trainer import PlannerTrainer
@@ -197,6 +198,7 @@ def test_a_resume_takes_no_setting_that_the_run_never_had(tmp_path: Path) -> Non
     [
         ("--eval-freq -1", "as the run began, with evaluations: --eval-freq -1 does not"),
         ("-params planner_gradient_steps:11", "gradient_steps was 10"),
+        ("-n 240 -params n_envs:3", "goes on with n_envs=1, as the replay has them, got 3"),
     ],
 )
 def test_a_refused_resume_leaves_the_run_as_it_was(
@@ -213,6 +215,19 @@ def test_a_refused_resume_leaves_the_run_as_it_was(
     assert_same_agents(finished, copy)
     train.main(["--resume", str(copy), "-n", "240"])
     assert SAID.load(copy / f"{ENV}.zip").num_timesteps == 240 and (copy / ENDED_NAME).is_file()
+    assert len([*copy.glob("*.monitor.csv")]) == 1
+
+
+@pytest.mark.parametrize(("given", "evaluated"), [([], 8.0), (["--eval-env-kwargs", "g:5.0"], 5.0)])
+def test_a_resume_with_another_task_keeps_that_of_its_evaluations(
+    given: list[str], evaluated: float, tmp_path: Path
+) -> None:
+    words = "--algo sa --env Pendulum-v1 --preset smoke -n 60 --delay 1 --env-kwargs g:9.0"
+    train_here(tmp_path, words, *given)
+    (run,) = (tmp_path / "sa").iterdir()
+    train.main(["--resume", str(run), "-n", "80", "--env-kwargs", "g:8.0"])
+    record = Record.read(run)
+    assert (record.env_kwargs, record.eval_env_kwargs) == ({"g": 8.0}, {"g": evaluated})
 
 
 def test_a_file_s_settings_reach_the_evaluations_and_stay_beside_those_given(
@@ -379,6 +394,7 @@ def test_says_what_is_wrong(words: str, message: str, tmp_path: Path, capsys: py
         ("-params batch_size:0", "batch_size is 0"),
         ("-params train_freq:0", "train_freq is 0"),
         ("-params n_envs:0", "n_envs must be at least 1, got 0"),
+        ("-params env_wrapper:'gymnasium.wrappers.NormalizeObservation'", "statistics that no file holds"),
         ("-params frame_stack:2", "frame_stack wraps all environments at once, and no command could play the agent"),
         ("-tb /dev/null/x", "/dev/null"),
     ],
@@ -442,10 +458,13 @@ def test_a_nan_of_the_task_is_in_no_checkpoint(
 def test_a_full_disk_at_the_planners_checkpoint_loses_no_planner(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(path: Path, tree: Any) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+    def full(path: Path, *args: Any) -> None:
+        if path.name.startswith("planner"):
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        save(path, *args)
 
-    monkeypatch.setattr("sb3_said.said.training.save_tree", full)
+    save = checkpoint.save_tree
+    monkeypatch.setattr(checkpoint, "save_tree", full)
     with pytest.warns(UserWarning, match=r"written to .*planner_checkpoint.zip \(.*No space left on device"):
         train.main(arguments(tmp_path))
     model = SAID.load(run_of(tmp_path) / f"{ENV}.zip")
