@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.env_util import is_wrapped, unwrap_wrapper
+from stable_baselines3.common.env_util import unwrap_wrapper
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
@@ -153,16 +153,16 @@ class DelayedSAC(SafeSaveMixin, SAC):
             found = env.get_attr("task_id", 0)[0]  # of a wrapper of ours; a task may mean something else by it
             self.task = found if isinstance(found, str) else self.task
 
-    def _check_env(self, env: GymEnv) -> None:
+    def _check_env(self, env: VecEnv) -> None:
         """Refuse spaces that are not served, and what no space tells of an environment, with a ``ValueError``."""
         check_spaces(env.observation_space, env.action_space)
-        if isinstance(env.observation_space, spaces.Box) and _is_delayed(env):
+        if isinstance(env.observation_space, spaces.Box) and any(_are_wrapped(env, DelayedObservationWrapper)):
             raise ValueError(
                 "A wrapper around DelayedObservationWrapper made one array of its observation, in which an agent finds "
                 f"neither age nor actions: {env.observation_space}. {WRAPPER_ORDER}"
             )
         check_one_max_delay(env)
-        vec_normalize = unwrap_vec_normalize(env)  # type: ignore[arg-type]  # None for one that is no VecEnv
+        vec_normalize = unwrap_vec_normalize(env)
         keys = [] if vec_normalize is None or not vec_normalize.norm_obs else vec_normalize.norm_obs_keys or []
         if not set(keys) <= {"observation"}:
             raise ValueError(
@@ -287,6 +287,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
 
         :raises ValueError: for other spaces, another ``max_delay`` or a ``VecNormalize`` of more than the observation
         """
+        env = self._wrap_env(env, self.verbose)
         self._check_env(env)
         is_delayed = isinstance(self.observation_space, spaces.Dict)
         if is_delayed != isinstance(env.observation_space, spaces.Dict):
@@ -392,13 +393,6 @@ class DelayedSAC(SafeSaveMixin, SAC):
                 replay = self._new_replay_buffer(len(state["rewards"]) + 1, n_envs=1)
             replay.load_state_dict(state)
         self.replay_buffer, replay.device = replay, self.device
-
-
-def _is_delayed(env: Any) -> bool:
-    """Tell whether a ``DelayedObservationWrapper`` is somewhere in an environment, or in one of a ``VecEnv``."""
-    if isinstance(env, VecEnv):
-        return any(_are_wrapped(env, DelayedObservationWrapper))
-    return is_wrapped(env, DelayedObservationWrapper)
 
 
 def _has_attr(env: VecEnv, name: str) -> bool:

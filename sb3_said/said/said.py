@@ -12,7 +12,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.vec_env import unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_said.delays.space import ages_of, has_state_history
 from sb3_said.files.archive import PathOrFile
@@ -123,9 +123,9 @@ class SAID(PlannerLearner, StableSAC):
         policy = getattr(self, "policy", None)
         return self._given_planner_kwargs if policy is None else policy.planner.config.to_dict()
 
-    def _check_env(self, env: GymEnv) -> None:
+    def _check_env(self, env: VecEnv) -> None:
         super()._check_env(env)
-        vec_normalize = unwrap_vec_normalize(env)  # type: ignore[arg-type]  # None for one that is no VecEnv
+        vec_normalize = unwrap_vec_normalize(env)
         if has_state_history(env.observation_space) and vec_normalize is not None and vec_normalize.norm_obs:
             raise ValueError(
                 "VecNormalize scales the observation and not the state_history, which must have the same units; use "
