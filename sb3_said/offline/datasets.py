@@ -15,7 +15,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from sb3_said.delays.space import check_spaces
 from sb3_said.offline.checks import Columns, check_lengths, check_task, checked, flags
 from sb3_said.offline.sources import Log, read_buffer, read_file, read_minari
-from sb3_said.replay.buffer import DelayedReplayBuffer
+from sb3_said.replay.buffer import DelayedReplayBuffer, rows_for_logs
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Dataset:
         :param buffer_kwargs: of that :class:`~sb3_said.replay.buffer.DelayedReplayBuffer`
         """
         max_delay = check_spaces(observation_space, action_space).max_delay
-        size = max(len(self) + 1, max_delay + 2)  # a full buffer has lost its oldest past, and does not sample it
+        size = rows_for_logs(len(self), max_delay)
         buffer = buffer_class(size, observation_space, action_space, **buffer_kwargs)
         ends, lengths = np.flatnonzero(self.ends), self.lengths
         ages, tail_ages = np.zeros(len(self), np.int16), np.zeros(len(ends), np.int16)

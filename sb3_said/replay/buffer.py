@@ -21,6 +21,11 @@ UNCHANGED = 1e-3  # of [-1, 1]: what a wrapper's arithmetic in float32 may be of
 NORMALIZED_ROWS = 10_000  # at a time
 
 
+def rows_for_logs(n_steps: int, max_delay: int) -> int:
+    """Return how many rows logs need: a full buffer has lost its oldest past, and does not sample it."""
+    return max(n_steps + 1, max_delay + 2)
+
+
 class DelayedReplayBuffer(ReplayBuffer):
     """Replay of a delayed task, at the memory of an undelayed one.
 

@@ -32,7 +32,7 @@ from sb3_said.delays.wrapper import DelayedObservationWrapper
 from sb3_said.files.agents import SafeSaveMixin, existing, with_suffix
 from sb3_said.files.archive import load_tree, readable, save_tree
 from sb3_said.files.checks import RANGES, check_range
-from sb3_said.replay.buffer import DelayedReplayBuffer
+from sb3_said.replay.buffer import DelayedReplayBuffer, rows_for_logs
 from sb3_said.sac.policies import SERVED, DelayedSACPolicy, as_array
 
 
@@ -390,7 +390,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
         replay = self._new_replay_buffer() if self.replay_buffer is None else self.replay_buffer
         with readable(found, explained=(ValueError,)):
             if state["holds_logs"] is True:  # however long they are
-                replay = self._new_replay_buffer(len(state["rewards"]) + 1, n_envs=1)
+                replay = self._new_replay_buffer(rows_for_logs(len(state["rewards"]), self.policy.max_delay), n_envs=1)
             replay.load_state_dict(state)
         self.replay_buffer, replay.device = replay, self.device
 

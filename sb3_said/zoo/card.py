@@ -152,8 +152,9 @@ def describe(
         **({} if run.normalize is None else {"belongs beside it": f"`{normalization_file(file).name}`"}),
         "median decision": "not measured" if latency_ms is None else f"{latency_ms:g} ms, one CPU thread",
     }
-    task = f"--delay {longest_delay(run.model) or 0}" + "".join(f" --gym-packages {x}" for x in record.gym_packages)
-    shows = f"`sb3-said enjoy {file.name} {task} --record video.mp4` shows it."
+    packages = ["--gym-packages", *record.gym_packages] if record.gym_packages else []
+    words = ["enjoy", file.name, "--delay", str(longest_delay(run.model) or 0), *packages, "--record", "video.mp4"]
+    shows = f"`sb3-said {shlex.join(words)}` shows it."
     if run.changes:
         shows = "It plays right in its run's folder, or in an environment of yours with the changes below."
     lines = [

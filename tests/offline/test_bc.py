@@ -250,6 +250,15 @@ def test_a_replay_of_logs_is_as_long_as_they_are(tmp_path):
     other.learn_offline(None, 2)
 
 
+def test_a_replay_of_a_short_log_comes_back_too(tmp_path):
+    model = make()  # whose buffer holds more than the steps that a delay of 3 looks back
+    model.take_dataset(demonstrations(1, length=1))
+    model.save_replay_buffer(tmp_path / "replay")
+    other = make()
+    other.load_replay_buffer(tmp_path / "replay")
+    assert other.replay_buffer.size() == 1 and other.replay_buffer.buffer_size == model.replay_buffer.buffer_size
+
+
 def test_an_interval_of_the_log_is_a_count():
     with pytest.raises(ValueError, match="log_interval must be a whole number, at least 1, got 0"):
         make().learn_offline(demonstrations(2), 2, log_interval=0)

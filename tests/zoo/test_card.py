@@ -140,8 +140,8 @@ def test_an_agent_of_logs_has_met_all_ages_of_its_delay(run: Path) -> None:
 
 def test_the_card_says_what_plays_an_agent_of_a_task_of_ones_own(run: Path) -> None:
     played, results = load_run(run, device="cpu"), cast(Any, SimpleNamespace(settings={"n_episodes": 1, "seed": 0}))
-    record = Record("said", ENV, 3, 2, gym_packages=["mine"])
-    assert "--delay 2 --gym-packages mine --record video.mp4` shows it." in card.describe(
+    record = Record("said", ENV, 3, 2, gym_packages=["mine", "yours"])
+    assert "--delay 2 --gym-packages mine yours --record video.mp4` shows it." in card.describe(
         played, record, results, [], None, 0
     )
     played.changes["env_kwargs"] = {"g": 1.0}
