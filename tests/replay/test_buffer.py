@@ -140,14 +140,14 @@ def test_relabelled_ages_show_what_would_have_been_observed_at_them(player_and_s
     sampled = batch_arrays(fill(make_buffer(player, steps_per_env, relabelled_ages=part), rows).sample(300))
     ages, next_ages = (sampled[f"{name}/delay"][:, 0].astype(int) for name in ("observations", "next_observations"))
     assert np.all(next_ages <= ages + 1)
+    expected = []
     for i, tag in enumerate(sampled[f"observations/{UNDELAYED}"][:, 0].astype(int)):
         states, row, env = found[tag]
-        seen = {"observations/observation": states[:-1][-1 - ages[i]], "observations/delay": ages[i]}
-        seen |= {"next_observations/observation": states[-1 - next_ages[i]], "next_observations/delay": next_ages[i]}
-        for name, expected in (
-            naive_transition(row, env, player.vec.observation_space["action_history"].shape[0]) | seen
-        ).items():
-            np.testing.assert_array_equal(sampled[name][i].squeeze(), np.squeeze(expected), err_msg=name)
+        seen = {"observations/observation": states[:-1][-1 - ages[i]], "observations/delay": ages[[i]]}
+        seen |= {"next_observations/observation": states[-1 - next_ages[i]], "next_observations/delay": next_ages[[i]]}
+        expected.append(naive_transition(row, env, player.vec.observation_space["action_history"].shape[0]) | seen)
+    for name, values in sampled.items():
+        np.testing.assert_array_equal(values, np.stack([each[name] for each in expected]), err_msg=name)
 
 
 @pytest.mark.parametrize("part", [0.0, 0.4, 1.0])
@@ -255,7 +255,8 @@ def test_actions_that_take_a_time_each_are_stored_as_they_are_executed(process, 
     first = int(rows[0].states[0, 0])
     states = {int(row.states[0, 0]): row.states[0] for row in rows}
     executed = {int(row.states[0, 0]): row.infos[0]["executed_action"] for row in rows}
-    for i, tag in enumerate(batch[f"observations/{UNDELAYED}"][:, 0].astype(int).tolist()):
+    tags, first_samples = np.unique(batch[f"observations/{UNDELAYED}"][:, 0].astype(int), return_index=True)
+    for tag, i in zip(tags.tolist(), first_samples, strict=True):
         row = next(row for row in rows if int(row.states[0, 0]) == tag)
         np.testing.assert_array_equal(batch["actions/"][i], executed[tag])
         np.testing.assert_array_equal(batch[f"next_observations/{UNDELAYED}"][i], row.next_states[0])
