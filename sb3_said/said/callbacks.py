@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_said.planner.checks import check_intervals
 
@@ -21,6 +22,7 @@ class PlannerTrainingCallback(BaseCallback):
     :param progress_bar: show one
     :param should_stop: asked after every update; a training that it ends writes its checkpoint and raises
         ``KeyboardInterrupt``
+    :param make_trial_env: as of :meth:`~sb3_said.said.SAID.train_planner`
     :param intervals: in updates, ``log_interval``, ``eval_interval`` or ``save_interval`` of
         :meth:`~sb3_said.said.SAID.train_planner`
     :raises TypeError: for another name
@@ -35,14 +37,15 @@ class PlannerTrainingCallback(BaseCallback):
         progress_bar: bool = False,
         verbose: int = 0,
         should_stop: Callable[[], bool] | None = None,
+        make_trial_env: Callable[[int], VecEnv] | None = None,
         **intervals: int | None,
     ):
         super().__init__(verbose)
         if unknown := sorted(set(intervals) - {"log_interval", "eval_interval", "save_interval"}):
             raise TypeError(f"PlannerTrainingCallback has no argument {', '.join(unknown)}.")
         check_intervals(**intervals)  # and not when the planner is trained, after all of learn()'s steps
-        how = {"folder": folder, "progress_bar": progress_bar, "should_stop": should_stop}
-        self.how: dict[str, Any] = {**how, **intervals}
+        how = {"progress_bar": progress_bar, "should_stop": should_stop, "make_trial_env": make_trial_env}
+        self.how: dict[str, Any] = {"folder": folder, **how, **intervals}
 
     def _on_training_start(self) -> None:
         if self.model.num_timesteps < self.model._planner_trained_at:  # counting began anew

@@ -9,16 +9,20 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.utils import check_for_correct_spaces
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from tqdm.auto import tqdm
 
+from sb3_said.files.normalization import get_statistics, set_statistics
 from sb3_said.planner import InpaintingPlanner
 from sb3_said.said.ways import players_of
 
 SAID = Any  # whose module imports this one
+MakeEnv = Callable[[int], VecEnv]  # of a number of environments
 
 CUT_AT = 10  # times the longest stored episode: a good answer may never end one
 FIRST_PART = 0.25  # of a trial's episodes, which all ways play
+AT_ONCE = 5  # environments: a CPU core decides for each in a quarter of the time (measured, results/settings.md)
 GO_ON = 3  # ways that play the others, too (simulated with episodes of 30 planners, results/settings.md)
 
 
@@ -63,6 +67,7 @@ def play_trial(
     progress_bar: bool = False,
     should_stop: Callable[[], bool] | None = None,
     planners: Sequence[InpaintingPlanner] = (),
+    make_env: MakeEnv | None = None,
 ) -> Trial:
     """Play the training environment with the planner, in each of its ways, and with the expert, from the same seeds.
 
@@ -77,6 +82,8 @@ def play_trial(
     :param progress_bar: show one
     :param should_stop: asked after every step
     :param planners: other trained planners, which ways of their masks play; ways whose mask none has are left out
+    :param make_env: makes environments like the training's, to play in several at once; without it, or where the
+        training has as many, its own play
     :raises TrialStopped: when ``should_stop`` has ended the trial
     """
     policy, seed = model.policy, int(np.random.randint(2**31))
@@ -104,7 +111,7 @@ def play_trial(
         ages = np.append(ages, np.min(met, axis=0))  # whoever falls at once does not tell it
 
     try:
-        with model.borrowed_env() as env:
+        with _env_of(model, n_episodes, make_env) as env:
             n_first = n_episodes if len(ways) <= GO_ON else int(np.ceil(FIRST_PART * n_episodes))
             # Environments, whose delays may differ, have their turns; else they would step on for those that play
             n_first = min(n_episodes, int(np.ceil(n_first / env.num_envs)) * env.num_envs)
@@ -116,6 +123,26 @@ def play_trial(
     finally:
         policy.take_planner(*own)
     return Trial(returns, _if_settled(ages), n_steps)
+
+
+@contextmanager
+def _env_of(model: SAID, n_episodes: int, make_env: MakeEnv | None) -> Iterator[VecEnv]:
+    """Hand out what a trial is played in: the training environment, or those that are made, and closed behind it."""
+    n_envs = min(AT_ONCE, n_episodes)
+    if make_env is None or model.env.num_envs >= n_envs:
+        with model.borrowed_env() as env:
+            yield env
+        return
+    env = make_env(n_envs)
+    try:
+        check_for_correct_spaces(env, model.observation_space, model.action_space)
+        normalizer = unwrap_vec_normalize(env)
+        set_statistics(normalizer, get_statistics(model.get_vec_normalize_env()))
+        if normalizer is not None:
+            normalizer.training = normalizer.norm_reward = False
+        yield env
+    finally:
+        env.close()
 
 
 def _if_settled(ages: np.ndarray) -> np.ndarray:
@@ -197,6 +224,7 @@ def let_the_best_answer(
     progress_bar: bool = False,
     should_stop: Callable[[], bool] | None = None,
     planners: Sequence[InpaintingPlanner] = (),
+    make_env: MakeEnv | None = None,
 ) -> dict[str, float | str]:
     """Let the planner in its best way answer, or the expert, or both, each at the ages at which it does better.
 
@@ -204,10 +232,11 @@ def let_the_best_answer(
     only if that :func:`gains_more_than_its_error` over the better of the two. Warn where the expert alone answers.
 
     :param planners: beside the agent's own, as of :func:`play_trial`; the agent takes the one of the best way
+    :param make_env: as of :func:`play_trial`
     :return: mean returns, the way that is taken, the expert's ages, and the number of steps played, for the log
     """
     own, players = (model.policy.planner, model.policy.planner.config), players_of(model, planners)
-    trial = play_trial(model, n_episodes, progress_bar, should_stop, planners)
+    trial = play_trial(model, n_episodes, progress_bar, should_stop, planners, make_env)
     expert = trial.returns["expert"]
     played = {name: returns for name, returns in trial.returns.items() if len(returns) == len(expert)}
     ways = [name for name in played if name != "expert"]

@@ -9,6 +9,7 @@ import zlib
 from collections.abc import Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
+from functools import partial
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -331,9 +332,10 @@ class DelayedExperimentManager(ExperimentManager):
         self.checkpointing = TrainingCheckpointCallback(self.folder, self.run.checkpoint_freq, self.stopping)
         self.callbacks.append(self.checkpointing)
         if self.algo == "said":
-            self.callbacks.append(
-                PlannerTrainingCallback(folder=self.folder, progress_bar=self.show_progress, should_stop=self.stopping)
-            )
+            how: dict[str, Any] = {"progress_bar": self.show_progress, "should_stop": self.stopping}
+            if self.evaluation is not None:  # else the training's may be the only one, as of a robot
+                how["make_trial_env"] = partial(self.create_envs, no_log=True)
+            self.callbacks.append(PlannerTrainingCallback(self.folder, **how))
 
     def learn(self, model: BaseAlgorithm) -> None:
         """Train, from the last checkpoint if there is one. Ctrl-C, SIGTERM or SIGHUP ends it with a checkpoint.

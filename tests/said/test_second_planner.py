@@ -33,7 +33,7 @@ def rig(monkeypatch, best):
     """Let a trial find one way best; return which planners it was given, besides the agent's own."""
     given = []
 
-    def play(model, n_episodes, progress_bar, should_stop, planners):
+    def play(model, n_episodes, progress_bar, should_stop, planners, _):
         given.append(planners)
         names = {"planner", *WAYS, "expert"}
         played = {name: np.full(3, float(name == best)) + np.arange(3) for name in names}

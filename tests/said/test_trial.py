@@ -138,6 +138,54 @@ def test_episodes_of_several_environments_are_the_same_ones_whoever_ends_first()
     assert set(found.ages) <= {0, 1, 2} and len(set(found.ages)) > 1
 
 
+def test_a_trial_in_environments_that_are_made_is_the_one_in_the_trainings(trained, monkeypatch):
+    """Each environment plays the starts that one alone would. (Of the agent's own way rounding decides candidates.)"""
+    monkeypatch.setattr(trained, "planner_ways", {"one_step": WAYS["one_step"], "actor": WAYS["actor"]})
+    made, closed = [], []
+
+    def make_env(n_envs):
+        made.append(DummyVecEnv([lambda: Monitor(pendulum(delay=(0, 2)))] * n_envs))
+        monkeypatch.setattr(made[-1], "close", lambda: closed.append(n_envs))
+        return made[-1]
+
+    np.random.seed(3)
+    expected = trial.play_trial(trained, 6)
+    with monkeypatch.context() as patch:
+        patch.setattr(trained, "borrowed_env", lambda: pytest.fail("borrowed"))
+        np.random.seed(3)
+        found = trial.play_trial(trained, 6, make_env=make_env)
+    assert ([env.num_envs for env in made], closed) == ([trial.AT_ONCE], [trial.AT_ONCE])
+    assert [*found.returns] == [*expected.returns] == ["one_step", "actor", "planner", "expert"]
+    for who in ("one_step", "actor", "expert"):
+        np.testing.assert_allclose(found.returns[who], expected.returns[who], rtol=1e-4)
+    np.testing.assert_array_equal(found.ages, expected.ages)
+    trial.play_trial(trained, 2, make_env=make_env)
+    assert made[-1].num_envs == 2  # no more than there are episodes
+    trial.play_trial(trained, 1, make_env=lambda _: pytest.fail("made one more, as the training's"))
+
+
+def test_environments_that_are_made_show_what_those_of_the_training_do(monkeypatch):
+    """Scaled observations, and rewards as they are."""
+
+    def make_env(n_envs=1, **kwargs):
+        env = DummyVecEnv([lambda: Monitor(pendulum())] * n_envs)
+        return VecNormalize(env, norm_obs_keys=["observation"], **kwargs)
+
+    model, made = make(env=make_env(), planner_ways={}).learn(60), []
+    np.random.seed(3)
+    expected = trial.play_trial(model, 3).returns
+    np.random.seed(3)
+    found = trial.play_trial(model, 3, make_env=lambda n: made.append(make_env(n)) or made[0]).returns
+    np.testing.assert_allclose(found["expert"], expected["expert"], rtol=1e-4)
+    own = model.get_vec_normalize_env()
+    assert own.training and made[0].obs_rms["observation"].count == own.obs_rms["observation"].count > 60
+
+    for other in (make_env().venv, make_env(norm_obs=False), VecMonitor(DummyVecEnv([Drift]))):
+        monkeypatch.setattr(other, "num_envs", 3)
+        with pytest.raises(ValueError, match=r"VecNormalize normalised|spaces do not match"):
+            trial.play_trial(model, 3, make_env=lambda n, other=other: other)
+
+
 def test_each_of_the_environments_plays_though_their_delays_differ():
     env = DummyVecEnv([lambda delay=delay: Monitor(pendulum(9, delay, 2)) for delay in range(3)])
     model = make(env=env, planner_ways=OF_ONE_PLANNER).learn(60)

@@ -29,6 +29,7 @@ from sb3_said.files import checkpoint
 from sb3_said.files.archive import load_tree
 from sb3_said.files.checkpoint import TrainingCheckpointCallback
 from sb3_said.planner.trainer import PlannerTrainer
+from sb3_said.said import trial
 from sb3_said.zoo import manager, train
 from sb3_said.zoo.arguments import Delay
 from sb3_said.zoo.folder import log_suffix
@@ -81,6 +82,23 @@ def test_a_run_leaves_an_agent_that_answers_with_its_planner(finished: Path) -> 
     assert "DelayedObservationWrapper" in config and "delay: 2" in config
     header = (finished / "progress.csv").read_text().splitlines()[0]
     assert "planner/present_error_mlp_d2" in header and "planner/action_error_d2" in header
+
+
+@pytest.mark.parametrize(("more", "n_envs"), [((), 3), (("--eval-freq", "-1"), 1)])
+def test_a_trial_plays_in_several_environments_where_the_run_may_make_more_than_one(
+    more: tuple[str, ...], n_envs: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played, original = [], trial._play
+
+    def play(model: Any, env: Any, *args: Any) -> Any:
+        played.append((env.num_envs, ages_of(env)))
+        return original(model, env, *args)
+
+    monkeypatch.setattr(trial, "_play", play)
+    train.main([*arguments(tmp_path), "planner_trial_episodes:3", *more])
+    assert {*map(str, played)} == {str((n_envs, [2]))}
+    rows = (run_of(tmp_path) / "0.monitor.csv").read_text().splitlines()[2:]
+    assert sum(int(row.split(",")[1]) for row in rows) <= 200  # of the training's steps, and none of the trial's
 
 
 def test_a_finished_run_has_nothing_left_to_do_and_else_resumes_to_the_same_agent(
