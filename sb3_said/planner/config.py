@@ -153,7 +153,7 @@ class PlannerConfig:
         if self.present == "guessed" and not can_guess:
             raise ValueError(
                 f"present is 'guessed' with first_guess={self.first_guess!r} and mask={self.mask!r}; expected a "
-                "first_guess and another mask than 'fixed', by which the planner knows age 0."
+                "first_guess and another mask than 'fixed', by which the planner knows age 0, or present='inpainted'."
             )
         if self.mask == "none" and self.present != "guessed":
             raise ValueError(
