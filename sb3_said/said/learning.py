@@ -106,7 +106,8 @@ class PlannerLearner(OfflineAlgorithm):
             no expert to compare with
         :param should_stop: asked after every update; where it says so, a checkpoint is written and the training ends
         :param make_trial_env: makes a number of environments like the training's, as ``lambda n: make_vec_env(make,
-            n)``. The trial plays in them at once, three times as fast as in one; without it, in the training's own
+            n)``. The trial plays in them at once, three times as fast as in one; without it, or where it fails, in the
+            training's own
         :raises KeyboardInterrupt: when ``should_stop`` has ended the training
         :raises ValueError: for an interval below 1, when the buffer is empty, or the checkpoint is of a training with
             other settings

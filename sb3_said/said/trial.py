@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 from stable_baselines3.common.utils import check_for_correct_spaces
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 from tqdm.auto import tqdm
 
 from sb3_said.files.normalization import get_statistics, set_statistics
@@ -32,16 +32,17 @@ class TrialStopped(KeyboardInterrupt):
 
 @contextmanager
 def stopped_alone() -> Iterator[None]:
-    """Let Ctrl-C, or what is no number in task or planner, end the trial that is played inside, and nothing else."""
+    """Let Ctrl-C, or an error of task or planner, end the trial that is played inside, and nothing else."""
     try:
         yield
     except TrialStopped:
         raise
     except KeyboardInterrupt:
         print("The trial was interrupted: the planner answers as it is. train_planner() plays one later.")
-    except ValueError as error:
+    except Exception as error:  # of any simulator: what was learned is not lost by it
         warnings.warn(
-            f"The trial has failed, and the planner answers as it is: {error} train_planner() plays one later.",
+            f"The trial has failed, and the planner answers as it is: {type(error).__name__}: {error} "
+            "train_planner() plays one later.",
             stacklevel=4,
         )
 
@@ -129,20 +130,40 @@ def play_trial(
 def _env_of(model: SAID, n_episodes: int, make_env: MakeEnv | None) -> Iterator[VecEnv]:
     """Hand out what a trial is played in: the training environment, or those that are made, and closed behind it."""
     n_envs = min(AT_ONCE, n_episodes)
-    if make_env is None or model.env.num_envs >= n_envs:
+    made = None if make_env is None or model.env.num_envs >= n_envs else _made(model, make_env, n_envs)
+    if made is None:
         with model.borrowed_env() as env:
             yield env
         return
-    env = make_env(n_envs)
     try:
-        check_for_correct_spaces(env, model.observation_space, model.action_space)
-        normalizer = unwrap_vec_normalize(env)
-        set_statistics(normalizer, get_statistics(model.get_vec_normalize_env()))
-        if normalizer is not None:
-            normalizer.training = normalizer.norm_reward = False
-        yield env
+        yield made
     finally:
-        env.close()
+        made.close()
+
+
+def _made(model: SAID, make_env: MakeEnv, n_envs: int) -> VecEnv | None:
+    """Make environments that show what the training's do; where that fails, warn, and return none."""
+    own, env = model.get_vec_normalize_env(), None
+    try:
+        env = make_env(n_envs)
+        if env.unwrapped is model.env.unwrapped:
+            return None  # which is not to be closed
+        normalizer = unwrap_vec_normalize(env)
+        if own is not None and normalizer is None:
+            env = normalizer = VecNormalize(env, norm_obs=own.norm_obs, norm_obs_keys=own.norm_obs_keys)
+        check_for_correct_spaces(env, model.observation_space, model.action_space)
+        set_statistics(normalizer, get_statistics(own))
+        if own is not None and normalizer is not None:
+            normalizer.clip_obs, normalizer.epsilon = own.clip_obs, own.epsilon
+            normalizer.training = normalizer.norm_reward = False
+        return env
+    except Exception as error:  # of any simulator: what was learned is not lost by it
+        warnings.warn(
+            f"The trial is played in the training's own environment: {type(error).__name__}: {error}", stacklevel=6
+        )
+        if isinstance(env, VecEnv):
+            env.close()
+        return None
 
 
 def _if_settled(ages: np.ndarray) -> np.ndarray:

@@ -1,6 +1,7 @@
 """The trial after the planner's training measures what evaluate_policy does, and is no training."""
 
 import itertools
+import re
 from typing import ClassVar
 
 import gymnasium as gym
@@ -12,7 +13,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
-from sb3_said import DelayedObservationWrapper
+from sb3_said import DelayedObservationWrapper, PlannerTrainingCallback
 from sb3_said.delays import UniformDelay
 from sb3_said.planner import trainer as trainer_module
 from sb3_said.planner.trainer import GUESS_UPDATES_EACH
@@ -180,10 +181,45 @@ def test_environments_that_are_made_show_what_those_of_the_training_do(monkeypat
     own = model.get_vec_normalize_env()
     assert own.training and made[0].obs_rms["observation"].count == own.obs_rms["observation"].count > 60
 
-    for other in (make_env().venv, make_env(norm_obs=False), VecMonitor(DummyVecEnv([Drift]))):
-        monkeypatch.setattr(other, "num_envs", 3)
-        with pytest.raises(ValueError, match=r"VecNormalize normalised|spaces do not match"):
-            trial.play_trial(model, 3, make_env=lambda n, other=other: other)
+    for kwargs in (None, {"clip_obs": 0.5, "epsilon": 1.0}):  # without one, and of other settings
+        np.random.seed(3)
+        alike = trial.play_trial(
+            model, 3, make_env=lambda n, k=kwargs: make_env(n).venv if k is None else make_env(n, **k)
+        )
+        np.testing.assert_allclose(alike.returns["expert"], expected["expert"], rtol=1e-4)
+
+
+def test_where_environments_cannot_be_made_the_trainings_is_played_in_and_nothing_is_lost(recwarn):
+    env = VecNormalize(DummyVecEnv([lambda: Monitor(pendulum())]), norm_obs_keys=["observation"])
+
+    def fails(n):
+        raise OSError("Address already in use")
+
+    for make_env, warned in [
+        (fails, "Address already in use"),
+        (lambda n: VecMonitor(DummyVecEnv([Drift] * n)), "norm_obs_keys|spaces do not match"),
+        (lambda n: pendulum(), "no attribute"),
+        (lambda n: env, None),  # the training's own
+    ]:
+        callback = PlannerTrainingCallback(make_trial_env=make_env)
+        model = make(env=env, planner_ways={}, planner_trial_episodes=2)
+        recwarn.clear()
+        model.learn(60, callback=callback)
+        found = [str(w.message) for w in recwarn if "training's own environment" in str(w.message)]
+        assert bool(found) == (warned is not None) and all(re.search(warned, text) for text in found)
+        assert not any("trial has failed" in str(w.message) for w in recwarn)
+        assert env.training and env.norm_reward
+        env.reset()
+
+
+def test_an_error_of_the_task_amid_the_trial_loses_no_planner(monkeypatch):
+    def lost(*_):
+        raise RuntimeError("physics server lost")
+
+    monkeypatch.setattr(trial, "_play", lost)
+    with pytest.warns(UserWarning, match="physics server lost"):
+        model = make(env=pendulum(), planner_trial_episodes=2).learn(60)
+    assert model.policy.who_answers == "planner"
 
 
 def test_each_of_the_environments_plays_though_their_delays_differ():
@@ -388,7 +424,9 @@ def test_a_trial_whose_rewards_are_no_numbers_chooses_nothing(monkeypatch):
     played = trial._play
     monkeypatch.setattr(trial, "_play", play)
     env = DelayedObservationWrapper(Broken(gym.make("Pendulum-v1", max_episode_steps=15)), 2)
-    with pytest.warns(UserWarning, match="trial has failed, and the planner answers as it is: A reward of the trial"):
+    with pytest.warns(
+        UserWarning, match="trial has failed, and the planner answers as it is: ValueError: A reward of the trial"
+    ):
         model = make(env=env, planner_trial_episodes=2).learn(60)
     assert model.policy.who_answers == "planner" and model.policy.planner.config.temperature == 0.5  # as made
 
