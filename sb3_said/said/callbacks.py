@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_said.planner.checks import check_intervals
+from sb3_said.said.trial import MakeEnv
 
 
 class PlannerTrainingCallback(BaseCallback):
@@ -37,7 +37,7 @@ class PlannerTrainingCallback(BaseCallback):
         progress_bar: bool = False,
         verbose: int = 0,
         should_stop: Callable[[], bool] | None = None,
-        make_trial_env: Callable[[int], VecEnv] | None = None,
+        make_trial_env: MakeEnv | None = None,
         **intervals: int | None,
     ):
         super().__init__(verbose)

@@ -12,7 +12,6 @@ from typing import Any, TypeVar
 import torch as th
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import configure_logger
-from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_said.delays.space import ages_of
 from sb3_said.files.normalization import get_statistics, set_statistics
@@ -23,7 +22,7 @@ from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.planner.values import returns_to_go
 from sb3_said.said.policies import SAIDPolicy, Value
 from sb3_said.said.training import PlannerTraining
-from sb3_said.said.trial import let_the_best_answer, stopped_alone
+from sb3_said.said.trial import MakeEnv, let_the_best_answer, stopped_alone
 from sb3_said.said.ways import in_way, masks_of, ways_of
 
 HELD_OUT = 0.05  # of the planner's data
@@ -82,7 +81,7 @@ class PlannerLearner(OfflineAlgorithm):
         save_interval: int | None = None,
         trial_episodes: int | None = None,
         should_stop: Callable[[], bool] | None = None,
-        make_trial_env: Callable[[int], VecEnv] | None = None,
+        make_trial_env: MakeEnv | None = None,
     ) -> None:
         """Train the planner anew on the replay buffer, without running the expert; then see who answers better.
 
@@ -106,8 +105,8 @@ class PlannerLearner(OfflineAlgorithm):
             no expert to compare with
         :param should_stop: asked after every update; where it says so, a checkpoint is written and the training ends
         :param make_trial_env: makes a number of environments like the training's, as ``lambda n: make_vec_env(make,
-            n)``. The trial plays in them at once, three times as fast as in one; without it, or where it fails, in the
-            training's own
+            n)``. The trial plays in them at once, which is faster (results/settings.md); without it, or where it fails,
+            in the training's own
         :raises KeyboardInterrupt: when ``should_stop`` has ended the training
         :raises ValueError: for an interval below 1, when the buffer is empty, or the checkpoint is of a training with
             other settings
@@ -155,8 +154,9 @@ class PlannerLearner(OfflineAlgorithm):
                 planners.append(planner)
         if is_tried and outcome == "done":
             with stopped_alone():
-                how = progress_bar, should_stop, planners[1:], make_trial_env
-                training.log(let_the_best_answer(self, n_episodes, *how))
+                training.log(
+                    let_the_best_answer(self, n_episodes, progress_bar, should_stop, planners[1:], make_trial_env)
+                )
         if outcome == "stopped":
             raise KeyboardInterrupt
         self._planner_trained_at = self.num_timesteps
