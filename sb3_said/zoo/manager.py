@@ -7,7 +7,7 @@ import re
 import shutil
 import zlib
 from collections.abc import Sequence
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass
 from functools import partial
 from io import StringIO
@@ -380,8 +380,9 @@ class DelayedExperimentManager(ExperimentManager):
                   "last checkpoint, or begins again where there is none.")  # fmt: skip
             raise
         finally:
-            if model.env is not None:
-                model.env.close()
+            with suppress(EOFError, ConnectionError):  # of processes that have ended already
+                if model.env is not None:
+                    model.env.close()
 
     def _learn(self, model: Any, steps: int, **how: Any) -> None:
         """Learn for so many steps, and evaluate the planner where there is one."""

@@ -26,7 +26,11 @@ class Stopping:
 
     @contextmanager
     def listening(self) -> Iterator[None]:
-        """Listen to the signals inside the context; outside the main thread nobody can."""
+        """Listen to the signals inside the context; outside the main thread nobody can.
+
+        :raises KeyboardInterrupt: where the signal has ended the environments' processes, too, as one to a whole
+            process group does, before the training could stop
+        """
         before: dict[int, Any] = {}
         if threading.current_thread() is threading.main_thread():
             before = {number: signal.getsignal(number) for number in SIGNALS}
@@ -35,6 +39,10 @@ class Stopping:
             signal.signal(number, self._ask)
         try:
             yield
+        except (EOFError, ConnectionError) as error:
+            if self.is_asked:
+                raise KeyboardInterrupt from error
+            raise
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)

@@ -173,8 +173,9 @@ def test_a_run_is_not_resumed_while_it_is_trained(
         train.main(["--resume", str(run_of(tmp_path))])
 
 
-def test_ctrl_c_reaches_a_training_whose_environments_are_processes(tmp_path: Path) -> None:
-    """A terminal sends it to all processes; those of the environments must outlive it."""
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda n: n.name)
+def test_a_signal_to_a_training_whose_environments_are_processes(number: signal.Signals, tmp_path: Path) -> None:
+    """It is sent to all: Ctrl-C by a terminal, which environments outlive, SIGTERM by a cluster, which ends them."""
     words = arguments(tmp_path, "--vec-env", "subproc")
     words[words.index("-n") + 1] = "1000000"
     process = begin(output := tmp_path / "output.txt", run_script, SCRIPT, words)
@@ -186,7 +187,7 @@ def test_ctrl_c_reaches_a_training_whose_environments_are_processes(tmp_path: Pa
                 break
             time.sleep(0.1)
         with suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGINT)
+            os.killpg(process.pid, number)
         process.join(timeout=120)
     finally:
         with suppress(ProcessLookupError):
