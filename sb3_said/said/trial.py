@@ -24,6 +24,7 @@ CUT_AT = 10  # times the longest stored episode: a good answer may never end one
 FIRST_PART = 0.25  # of a trial's episodes, which all ways play
 AT_ONCE = 5  # environments: a CPU core decides for each in a quarter of the time (measured, results/settings.md)
 GO_ON = 3  # ways that play the others, too (simulated with episodes of 30 planners, results/settings.md)
+LATER = "train_planner() plays one later, and so does --resume with as many steps (-n) as the run had."
 
 
 class TrialStopped(KeyboardInterrupt):
@@ -38,11 +39,10 @@ def stopped_alone() -> Iterator[None]:
     except TrialStopped:
         raise
     except KeyboardInterrupt:
-        print("The trial was interrupted: the planner answers as it is. train_planner() plays one later.")
+        print(f"The trial was interrupted: the planner answers as it is. {LATER}")
     except Exception as error:  # of any simulator: what was learned is not lost by it
         warnings.warn(
-            f"The trial has failed, and the planner answers as it is: {type(error).__name__}: {error} "
-            "train_planner() plays one later.",
+            f"The trial has failed, and the planner answers as it is: {type(error).__name__}: {error} {LATER}",
             stacklevel=4,
         )
 

@@ -119,6 +119,22 @@ def test_a_finished_run_has_nothing_left_to_do_and_else_resumes_to_the_same_agen
         train.main(["--resume", str(copy)])
 
 
+def test_a_trial_that_has_failed_is_played_by_a_resume_with_as_many_steps(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def breaks(*_: Any) -> Any:
+        raise OSError("no simulator")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(trial, "_play", breaks)
+        with pytest.warns(UserWarning, match="The trial has failed.*no simulator.*--resume with as many steps"):
+            train.main(arguments(tmp_path))
+    run = run_of(tmp_path)
+    train.main(["--resume", str(run), "-n", "200"])
+    assert "trial/way" in (run / "progress_200.csv").read_text()
+    assert_same_agents(finished, run)
+
+
 def test_a_killed_run_goes_on_from_its_checkpoint_twice_alike(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
