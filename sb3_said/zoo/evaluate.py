@@ -36,11 +36,10 @@ examples:
   sb3-said evaluate logs/said/Hopper-v5-delay4-seed1_1 --realtime --period 0.02
 
 Episode i starts from reset seed --seed + i, so two agents meet the same starts; --n-envs changes the speed, the
-rounding of agents other than SAID, and with --stochastic what is drawn. A return is the undiscounted sum of the
-task's own rewards, and a score is D4RL's, 0 for a random policy and 100 for an expert, where D4RL has both. Decisions
-are timed after the episodes, one at a time, from NumPy observation to NumPy action. The last agent of a run is played,
-and where an earlier one did best in training, that "best" one too, or alone where the run was killed: it was chosen on
-other episodes than these.
+rounding, and with --stochastic what is drawn. A return is the undiscounted sum of the task's own rewards, and a score
+is D4RL's, 0 for a random policy and 100 for an expert, where D4RL has both. Decisions are timed after the episodes,
+one at a time, from NumPy observation to NumPy action. The last agent of a run is played, and where an earlier one did
+best in training, that "best" one too, or alone where the run was killed: it was chosen on other episodes than these.
 
 With --realtime every answer is also made to wait: it takes effect at the first control step after the time that it
 took. The row "in real time" plans for that step. The row "latency ignored" plans for the step at which it was asked,
@@ -166,11 +165,13 @@ def evaluate(
 ) -> Summary:
     """Play the episodes and time the decisions of one answer."""
     label = answer or run.info["algo"]
-    with answering(run.model, answer), tqdm(total=n_episodes, desc=label, unit="episode", leave=False) as bar:
+    bar = tqdm(total=n_episodes, desc=label, unit="episode", leave=False)
+    with answering(run.model, answer, at_once=True), bar:
         played = run.play(n_episodes, seed, n_envs, deterministic=deterministic, on_episode=lambda *_: bar.update())
-        latency = None
-        if latency_calls > 0:
-            observations = collect_observations(run.make_env, min(latency_calls, 100), seed)
+    latency = None
+    if latency_calls > 0:
+        observations = collect_observations(run.make_env, min(latency_calls, 100), seed)
+        with answering(run.model, answer):
             latency = measure_latency(run.model, observations, latency_calls, deterministic, run.normalize)
     measured = played.terminated, played.action_changes
     return Summary.from_episodes(label, played.returns, played.lengths, latency, *measured)

@@ -24,6 +24,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.evaluation import Summary, rollout
 from sb3_said.files.normalization import normalization_file, save_normalization
+from sb3_said.said.policies import SAIDPolicy
 from sb3_said.zoo import enjoy, evaluate
 from sb3_said.zoo.record import Record
 from sb3_said.zoo.runs import control_period, load_run
@@ -39,12 +40,19 @@ def test_evaluate_measures_the_planner_and_the_expert(
 ) -> None:
     pytest.importorskip("matplotlib")
     plot, titles, save = run / "plot.png", [], evaluate.plots.save
+    decided: dict[bool, list[int]] = {True: [], False: []}
+    decide = SAIDPolicy._decide
 
     def recorded(ax: Any, path: Path) -> None:
         titles.append(ax.figure.get_suptitle())
         save(ax, path)
 
+    def counted(self: SAIDPolicy, observation: Any, is_experts: bool, deterministic: bool) -> th.Tensor:
+        decided[is_experts].append(len(observation["observation"]))
+        return decide(self, observation, is_experts, deterministic)
+
     monkeypatch.setattr(evaluate.plots, "save", recorded)
+    monkeypatch.setattr(SAIDPolicy, "_decide", counted)
     th.set_num_threads(2)
     evaluate.main([str(run), "--episodes", "3", "--n-envs", "2", "--latency-calls", "5", "--seed", "7",
                    "--plot", str(plot), "--device", "cpu"])  # fmt: skip
@@ -53,11 +61,13 @@ def test_evaluate_measures_the_planner_and_the_expert(
     assert (document["seed"], document["n_episodes"], document["trained_steps"]) == (7, 3, 100)
     assert [result["label"] for result in document["results"]] == ["planner", "expert"]
     assert document["origin"]["torch_threads"] == 1  # two would wait for each other on a busy machine
+    for sizes in decided.values():  # in episodes together, and timed one by one
+        assert 2 in sizes and set(sizes[-5:]) == {1}
     # The file holds what the library measures for the same agent and seeds.
     model = SAID.load(run / f"{ENV}.zip", device="cpu")
     for result in document["results"]:
-        with model.policy.answering(result["label"]):
-            played = rollout(model, lambda: DelayedObservationWrapper(gym.make(ENV), delay=2), 3, seed=7)
+        with model.policy.answering(result["label"], at_once=True):
+            played = rollout(model, lambda: DelayedObservationWrapper(gym.make(ENV), delay=2), 3, seed=7, n_envs=2)
         assert result["returns"] == played.returns.tolist() and result["lengths"] == played.lengths.tolist()
         assert result["latency"]["n_calls"] == 5
     out = capsys.readouterr().out

@@ -66,7 +66,7 @@ def check_report(run: Path) -> None:
     assert [getattr(config, name) for name in tried] == [winner[name] for name in tried]
     assert [one["label"] for one in report["results"]] == ["planner", "expert"]
     for one in report["results"]:
-        with best.model.policy.answering(one["label"]):
+        with best.model.policy.answering(one["label"], at_once=True):
             assert one["returns"] == best.play(report["n_episodes"], report["seed"], n_envs=8).returns.tolist()
 
 
