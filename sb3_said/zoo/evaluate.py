@@ -165,9 +165,9 @@ def evaluate(
 ) -> Summary:
     """Play the episodes and time the decisions of one answer."""
     label = answer or run.info["algo"]
-    bar = tqdm(total=n_episodes, desc=label, unit="episode", leave=False)
-    with answering(run.model, answer, at_once=True), bar:
-        played = run.play(n_episodes, seed, n_envs, deterministic=deterministic, on_episode=lambda *_: bar.update())
+    with tqdm(total=n_episodes, desc=label, unit="episode", leave=False) as bar:
+        how: dict[str, Any] = {"deterministic": deterministic, "on_episode": lambda *_: bar.update()}
+        played = run.play(n_episodes, seed, n_envs, answer=answer, **how)
     latency = None
     if latency_calls > 0:
         observations = collect_observations(run.make_env, min(latency_calls, 100), seed)

@@ -26,7 +26,7 @@ from sb3_said.evaluation import Summary, plots
 from sb3_said.files.atomic import check_writable
 from sb3_said.zoo.arguments import TRUST, add_playing, check_positive, explained, make_parser, read_delay
 from sb3_said.zoo.cells import AGE, Cell, Results, make_table, print_manners, print_scores, print_seeds, print_table
-from sb3_said.zoo.runs import ANSWERS, LoadedRun, answering, answers, delay_name, load_run, longest_delay, origin
+from sb3_said.zoo.runs import ANSWERS, LoadedRun, answers, delay_name, load_run, longest_delay, origin
 
 EPILOG = f"""\
 examples:
@@ -357,7 +357,6 @@ def play(
     """Play the episodes of a cell."""
     with at_any_age():
         run = load_run(cell.file, cell.algo, env_id, cell.delay, device, gym_packages=gym_packages, answer=cell.answer)
-        with answering(run.model, cell.answer, at_once=True):
-            played = run.play(episodes, seed, n_envs, age_error=cell.age_error)
+        played = run.play(episodes, seed, n_envs, age_error=cell.age_error, answer=cell.answer)
     measured = played.terminated, played.action_changes
     return Summary.from_episodes(cell.agent, played.returns, played.lengths, None, *measured)

@@ -72,11 +72,20 @@ class LoadedRun:
         """The task, where D4RL's reference returns are of it; empty where the run changes it."""
         return "" if self.changes else str(self.info["env"])
 
-    def play(self, n_episodes: int, seed: int, n_envs: int = 1, age_error: int = 0, **kwargs: Any) -> Rollout:
+    def play(
+        self,
+        n_episodes: int,
+        seed: int,
+        n_envs: int = 1,
+        age_error: int = 0,
+        answer: str | None = None,
+        **kwargs: Any,
+    ) -> Rollout:
         """Play whole episodes, see :func:`~sb3_said.evaluation.rollout`.
 
         :param age_error: control steps that the age is told wrong by, within what the agent was built for
-        :raises ValueError: for an ``age_error`` where the agent is told no age
+        :param answer: as of :func:`answering`; this one decides for the ``n_envs`` episodes at once
+        :raises ValueError: for an ``age_error`` where the agent is told no age, and for an answer that it does not have
         """
         if age_error and longest_delay(self.model) is None:
             raise ValueError(f"This {type(self.model).__name__} reads no age, so none can be told wrong.")
@@ -87,7 +96,8 @@ class LoadedRun:
                 observation = {**observation, "delay": age.astype(np.float32)}
             return observation if self.normalize is None else self.normalize(observation)
 
-        return rollout(self.model, self.make_env, n_episodes, seed, n_envs, normalize=read, **kwargs)
+        with answering(self.model, answer, at_once=True):
+            return rollout(self.model, self.make_env, n_episodes, seed, n_envs, normalize=read, **kwargs)
 
 
 def load_run(

@@ -27,7 +27,7 @@ from sb3_said.zoo.depths import DepthPlanners
 from sb3_said.zoo.evaluate import evaluate, print_table
 from sb3_said.zoo.folder import TUNED_NAME, TUNED_SETTINGS
 from sb3_said.zoo.record import Record
-from sb3_said.zoo.runs import LoadedRun, answering, answers, load_run, origin
+from sb3_said.zoo.runs import LoadedRun, answers, load_run, origin
 from sb3_said.zoo.search import (
     DRAWN,
     OWN_STUDY,
@@ -159,8 +159,7 @@ def tune(args: argparse.Namespace) -> None:
     )
 
     def play(seed: int, n: int) -> list[float]:
-        with answering(run.model, "planner", at_once=True):
-            return [float(value) for value in run.play(n, seed, n).returns]
+        return [float(value) for value in run.play(n, seed, n, answer="planner").returns]
 
     planners.train(args.depths)
     left = args.timeout - (time.monotonic() - began)
