@@ -138,7 +138,7 @@ def _env_of(model: SAID, n_episodes: int, make_env: MakeEnv | None) -> Iterator[
     try:
         yield made
     finally:
-        made.close()
+        _close(made)
 
 
 def _made(model: SAID, make_env: MakeEnv, n_envs: int) -> VecEnv | None:
@@ -162,8 +162,16 @@ def _made(model: SAID, make_env: MakeEnv, n_envs: int) -> VecEnv | None:
             f"The trial is played in the training's own environment: {type(error).__name__}: {error}", stacklevel=6
         )
         if isinstance(env, VecEnv):
-            env.close()
+            _close(env)
         return None
+
+
+def _close(env: VecEnv) -> None:
+    """Close environments that were made; an error of theirs, as of processes that have ended, loses no trial."""
+    try:
+        env.close()
+    except Exception as error:  # of any simulator
+        warnings.warn(f"The trial's environments could not be closed: {type(error).__name__}: {error}", stacklevel=6)
 
 
 def _if_settled(ages: np.ndarray) -> np.ndarray:

@@ -212,6 +212,20 @@ def test_where_environments_cannot_be_made_the_trainings_is_played_in_and_nothin
         env.reset()
 
 
+def test_environments_that_cannot_be_closed_lose_no_trial(trained, monkeypatch):
+    def make_env(n_envs):
+        env = DummyVecEnv([lambda: Monitor(pendulum(delay=(0, 2)))] * n_envs)
+        monkeypatch.setattr(env, "close", lost)
+        return env
+
+    def lost():
+        raise EOFError("a process has ended")
+
+    with pytest.warns(UserWarning, match="could not be closed: EOFError: a process has ended"):
+        found = trial.play_trial(trained, 2, make_env=make_env)
+    assert len(found.returns["expert"]) == 2
+
+
 def test_an_error_of_the_task_amid_the_trial_loses_no_planner(monkeypatch):
     def lost(*_):
         raise RuntimeError("physics server lost")
