@@ -22,7 +22,7 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
 from stable_baselines3.common.logger import Logger, make_output_format
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecNormalize
 
 from sb3_said import SAID, DelayedSAC, PlannerTrainingCallback, StableSAC
 from sb3_said.files.archive import SavedFileError
@@ -44,7 +44,7 @@ from sb3_said.zoo.folder import (
 )
 from sb3_said.zoo.presets import config_file, preset_overrides
 from sb3_said.zoo.record import ENDED_NAME, EVALUATED, GIVEN_NAME, Record, make_wrapper, options_of, with_delay
-from sb3_said.zoo.stopping import Stopping, shielded
+from sb3_said.zoo.stopping import Stopping, shield
 
 LONGEST_NAME = 100  # of what a folder says of delays and logs; file systems end at 255
 
@@ -245,8 +245,9 @@ class DelayedExperimentManager(ExperimentManager):
             self.env_wrapper = make_wrapper(
                 with_delay(self._own_wrappers, *(delays if self._of_expert else delays[::-1]))
             )
-        with shielded():
-            env = super().create_envs(*args, **kwargs)
+        if self.vec_env_class is SubprocVecEnv:
+            shield()
+        env = super().create_envs(*args, **kwargs)
         if not self._has_told and "action_history" not in getattr(env.observation_space, "spaces", {}):
             self._has_told = True  # a task may be registered with its delay, so its wrappers do not say
             print(f"NO DELAY: this trains on {self.env_name.gym_id} without any delay; --delay 4 adds one of 4 steps.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import signal
 import threading
 from collections.abc import Iterator
@@ -59,14 +60,19 @@ class Stopping:
         )
 
 
-@contextmanager
-def shielded() -> Iterator[None]:
-    """Start processes that ignore Ctrl-C: a terminal sends it to all, and the training needs them to its end."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
+def shield() -> None:
+    """Let environments' processes ignore Ctrl-C: a terminal sends it to all, and the training needs them to its end.
+
+    They are forked from a server, and ignore what it has ignored since it began. Where there is none, as on Windows,
+    Ctrl-C ends them, too.
+    """
+    is_main = threading.current_thread() is threading.main_thread()  # no other may set what is ignored
+    if not is_main or "forkserver" not in multiprocessing.get_all_start_methods():
         return
+    from multiprocessing.forkserver import ensure_running
+
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        yield
+        ensure_running()
     finally:
         signal.signal(signal.SIGINT, before)

@@ -127,6 +127,8 @@ def main(argv: list[str] | None = None) -> None:
         if made:
             raise
         parser.error(str(error))  # of the options that rl_zoo3 reads, some of which it evaluates
+    except KeyboardInterrupt:  # before or behind the training, which ends on its own
+        parser.exit(130, "\nInterrupted.\n")
     finally:
         for manager in made:
             manager.release()

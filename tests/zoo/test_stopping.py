@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -196,3 +198,36 @@ def test_a_signal_to_a_training_whose_environments_are_processes(number: signal.
     assert process.exitcode == 130 and "and wrote a checkpoint" in shown, shown
     steps = load_tree(run_of(tmp_path) / "checkpoint.zip")["counters"]["num_timesteps"]
     assert steps > 0 and f"Interrupted at step {steps}" in shown
+
+
+def test_environments_processes_ignore_ctrl_c_and_the_training_does_not(tmp_path: Path) -> None:
+    """Of a command, which has started no other process before."""
+    told = """
+from multiprocessing import get_context
+from signal import SIGINT, default_int_handler, getsignal, signal
+from sb3_said.zoo.stopping import shield
+if __name__ == "__main__":
+    signal(SIGINT, default_int_handler)  # which a background job of a shell ignores
+    shield()
+    with get_context("forkserver").Pool(1) as pool:
+        print(pool.apply(getsignal, [SIGINT]).name, getsignal(SIGINT).__name__)
+"""
+    (script := tmp_path / "command.py").write_text(told)
+    shown = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True).stdout
+    assert shown == "SIG_IGN default_int_handler\n"
+
+
+def test_ctrl_c_while_environments_are_made_is_not_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = manager.ExperimentManager.create_envs
+
+    def interrupted(*args: Any, **kwargs: Any) -> Any:
+        signal.raise_signal(signal.SIGINT)
+        return made(*args, **kwargs)
+
+    monkeypatch.setattr(manager.ExperimentManager, "create_envs", interrupted)
+    with pytest.raises(SystemExit) as stop:
+        train.main(arguments(tmp_path, "--vec-env", "subproc"))
+    assert stop.value.code == 130 and "Interrupted." in capsys.readouterr().err
+    assert not [*tmp_path.glob("said/*")]  # no run that could be gone on with
