@@ -405,8 +405,8 @@ class DelayedExperimentManager(ExperimentManager):
         assert isinstance(model, DelayedSAC)
         model.task = self.env_name.gym_id  # which environments in other processes do not tell
         file = self.folder / f"{self.env_name}.zip"
-        is_unfinished = self.stopping.is_asked and isinstance(model, SAID) and not model.policy.planner_is_trained
-        if is_unfinished and _has_planner(file):  # of a run that had ended, and is trained for longer
+        is_unfinished = self.stopping.is_asked and isinstance(model, SAID) and not has_its_planner(model)
+        if is_unfinished and _is_whole(file):  # of a run that had ended, and is trained for longer
             print(f"{file} stays as it was, with its planner.")
             return
         print(f"Saving to {self.save_path}")
@@ -448,9 +448,17 @@ class SaveNormalization(BaseCallback):
         return True
 
 
-def _has_planner(file: Path) -> bool:
-    """Tell whether an agent's file has a trained planner."""
+def has_its_planner(model: SAID) -> bool:
+    """Tell whether an agent's planner is trained to the end, and tried, on all that its expert has learned from.
+
+    One of logs is not told apart: its run is.
+    """
+    return bool(model.policy.planner_is_trained and model._planner_trained_at == model.num_timesteps)
+
+
+def _is_whole(file: Path) -> bool:
+    """Tell whether a file has an agent, and that its planner."""
     try:
-        return file.is_file() and SAID.load(file, device="cpu").policy.planner_is_trained
+        return file.is_file() and has_its_planner(SAID.load(file, device="cpu"))
     except SavedFileError:
         return False

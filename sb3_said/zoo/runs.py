@@ -36,8 +36,8 @@ from sb3_said.files.normalization import load_normalization, normalization_file
 from sb3_said.said.policies import Answer
 from sb3_said.zoo.arguments import Delay, largest_delay
 from sb3_said.zoo.folder import find_agent, find_normalization
-from sb3_said.zoo.manager import ALGORITHMS
-from sb3_said.zoo.record import WRAPPER, Record, import_packages, make_wrapper
+from sb3_said.zoo.manager import ALGORITHMS, has_its_planner
+from sb3_said.zoo.record import ENDED_NAME, WRAPPER, Record, import_packages, make_wrapper
 
 ANSWERS = get_args(Answer)
 DELAYS = {"delay", "max_delay", "state_history"}  # of the wrapper: what an agent plays under, and what it reads of it
@@ -182,12 +182,15 @@ def load_run(
 
 def _warn_if_unfinished(model: BaseAlgorithm, file: Path, record: Record | None) -> None:
     is_last = record is not None and file.name == record.agent_name  # and no better one of amid the training
-    if is_last and isinstance(model, SAID) and not model.policy.planner_is_trained:
-        warnings.warn(
-            f"This run stopped after {model.num_timesteps} steps, before its planner was trained: its expert plays. "
-            f"sb3-said train --resume {file.parent} goes on.",
-            stacklevel=3,
-        )
+    if not is_last or not isinstance(model, SAID) or has_its_planner(model) or (file.parent / ENDED_NAME).is_file():
+        return
+    has_some = model.policy.planner_is_trained
+    what = "trained to the end, and tried: it plays as it is" if has_some else "trained: its expert plays"
+    warnings.warn(
+        f"This run stopped after {model.num_timesteps} steps, before its planner was {what}. sb3-said train --resume "
+        f"{file.parent} goes on.",
+        stacklevel=3,
+    )
 
 
 def changes(env_kwargs: dict[str, Any], wrappers: list[Any]) -> dict[str, Any]:

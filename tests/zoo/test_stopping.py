@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -25,6 +26,7 @@ from sb3_said.files.archive import load_tree
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.sac import StableSAC
 from sb3_said.zoo import manager, train
+from sb3_said.zoo.runs import load_run
 from sb3_said.zoo.stopping import SIGNALS, Stopping
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "train.py"
@@ -117,16 +119,26 @@ def test_a_signal_to_the_planners_training_loses_no_update(
     assert stop.value.code == 130 and "go on with --resume" in capsys.readouterr().out
     assert load_tree(run / "planner_checkpoint.zip")["trainer"]["n_updates"] == 7
     assert not same(run, whole)
+    with pytest.warns(UserWarning, match="after 150 steps, before its planner was trained to the end, and tried: it"):
+        load_run(run)
     train.main(["--resume", str(run)])
     assert same(run, whole)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*stopped after")
+        load_run(run)
 
 
+@pytest.mark.parametrize("where", [(StableSAC, "train", 10), (PlannerTrainer, "step", 7)], ids=["expert", "planner"])
 def test_a_run_that_is_trained_for_longer_keeps_its_planner_until_it_has_another(
-    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    where: tuple[type, str, int],
+    whole: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     run = Path(shutil.copytree(whole, tmp_path / "run"))
     with monkeypatch.context() as patch:
-        signal_at(patch, StableSAC, "train", 10, signal.SIGINT)
+        signal_at(patch, *where, signal.SIGINT)
         with pytest.raises(SystemExit):
             train.main(["--resume", str(run), "-n", "200"])
     assert f"{ENV}.zip stays as it was, with its planner" in capsys.readouterr().out and same(run, whole)
@@ -205,6 +217,7 @@ def test_environments_processes_ignore_ctrl_c_and_the_training_does_not(tmp_path
     told = """
 from multiprocessing import get_context
 from signal import SIGINT, default_int_handler, getsignal, signal
+from sb3_said.zoo.runs import load_run
 from sb3_said.zoo.stopping import shield
 if __name__ == "__main__":
     signal(SIGINT, default_int_handler)  # which a background job of a shell ignores
