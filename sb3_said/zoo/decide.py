@@ -116,9 +116,9 @@ def hand_on(model: SAID, agent: Path, output: Path, compact: bool) -> None:
     keep_normalization(agent, output)
     model.save(output, compact=compact)
     print(f"Wrote {output}")
-    file, record = find_agent(agent)
+    record = find_agent(agent)[1]
     changed = {} if record is None else changes(record.env_kwargs, record.wrappers)
-    if changed and file.resolve().parent != output.resolve().parent:
+    if changed and find_agent(output)[1] != record:
         print(
             f"Its run changes the task beside its delay, which the file does not keep: {changed}. It plays right in "
             "its run's folder, or in an environment of yours with these."
@@ -126,9 +126,12 @@ def hand_on(model: SAID, agent: Path, output: Path, compact: bool) -> None:
 
 
 def keep_normalization(agent: Path, output: Path) -> None:
-    """Write the statistics of a run with ``VecNormalize`` beside its new file, too."""
+    """Write the statistics of a run with ``VecNormalize`` beside its new file, too, and leave no others there."""
     found, target = find_normalization(*find_agent(agent)), normalization_file(output)
-    if found is not None and not (target.exists() and target.samefile(found)):
+    if found is None and target.exists():
+        target.unlink()
+        print(f"Removed {target}, which belonged to another agent of that name")
+    elif found is not None and not (target.exists() and target.samefile(found)):
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(found, target)
         print(f"Wrote {target}, which belongs to it: what VecNormalize learned of its observations")

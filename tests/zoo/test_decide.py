@@ -21,6 +21,7 @@ from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.evaluation import collect_observations
 from sb3_said.files.normalization import normalization_file
 from sb3_said.zoo import decide, evaluate
+from sb3_said.zoo.answer import EXPERT_FOLDER
 from sb3_said.zoo.record import Record
 
 NEW = ["--temperature", "0.5", "--n-candidates", "3", "--choice-factor", "2", "--sampling-steps", "1"]
@@ -94,6 +95,9 @@ def test_statistics_of_normalised_observations_go_with_the_file(run: Path, tmp_p
     decide.main([str(source), "--compact", "-o", str(tmp_path / "elsewhere" / "small.zip")])
     assert normalization_file(tmp_path / "elsewhere" / "small.zip").read_bytes() == b"statistics"
     decide.main([str(source), "--compact", "-o", str(source)])  # in place
+    assert normalization_file(source).read_bytes() == b"statistics"
+    decide.main([str(run), "--compact", "-o", str(source)])  # another agent takes the name, and has none
+    assert not normalization_file(source).exists()
 
 
 def test_what_a_run_changes_in_its_task_is_told_where_the_file_leaves_it(
@@ -104,6 +108,9 @@ def test_what_a_run_changes_in_its_task_is_told_where_the_file_leaves_it(
     decide.main([str(changed), "--compact", "-o", str(tmp_path / "agent.zip")])
     assert "{'env_kwargs': {'reset_noise_scale': 0.1}}" in capsys.readouterr().out
     decide.main([str(changed), "--compact", "-o", str(changed / "agent.zip")])
+    (changed / EXPERT_FOLDER).mkdir()
+    best = shutil.copy(changed / f"{ENV}.zip", changed / EXPERT_FOLDER / "best_model.zip")  # which is of the run, too
+    decide.main([str(best), "--compact", "-o", str(changed / "agent.zip")])
     decide.main([str(run), "--compact", "-o", str(tmp_path / "plain.zip")])
     assert "does not keep" not in capsys.readouterr().out
 
