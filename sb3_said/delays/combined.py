@@ -141,9 +141,10 @@ class TotalDelay(BaseProcess):
         """Whether every action takes a time of its own, which only the wrapper can act out."""
         return isinstance(as_process(self.action).sample(np.random.default_rng(0)), Iterator)
 
-    def sample(self, rng: np.random.Generator) -> Iterator[int | None]:
+    def sample(self, rng: np.random.Generator) -> int | Iterator[int | None]:
         """Draw the observation delays from ``rng``, as they are without action delay, the action delay from a child.
 
+        :return: one number for the episode where both are
         :raises ValueError: for an action process that draws anew for every packet
         """
         added = packet_delays(self.action, rng.spawn(1)[0])
@@ -152,5 +153,7 @@ class TotalDelay(BaseProcess):
                 f"{self.action} draws a delay for every action, which the age of observations cannot express; give "
                 "TotalDelay to DelayedObservationWrapper as it is, not inside another process."
             )
-        k = next(added)
-        return (None if delay is None else delay + k for delay in packet_delays(self.observation, rng))
+        k, delays = next(added), packet_delays(self.observation, rng)
+        if isinstance(delays, itertools.repeat):
+            return next(delays) + k
+        return (None if delay is None else delay + k for delay in delays)

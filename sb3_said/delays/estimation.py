@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -91,6 +92,12 @@ def estimate_delay(
     of_blocks = np.stack([np.bincount(block, gain) for gain in gains.T], axis=1)  # (n_blocks, max_delay + 1)
     scores = of_blocks.sum(0) / n_rows
     best = int(scores.argmax())
+    if best == max_delay > 0:  # actions that resemble those before them point at it from beyond, with high confidence
+        warnings.warn(
+            f"The delay found, {best}, is the largest that was tried, and the true one may be larger: try a larger "
+            "max_delay.",
+            stacklevel=2,
+        )
 
     n_blocks = len(of_blocks)
     draws = np.random.default_rng(seed).multinomial(n_blocks, np.full(n_blocks, 1 / n_blocks), n_resamples)

@@ -38,6 +38,7 @@ class OfflineAlgorithm(DelayedSAC):
     The environment gives the spaces and the delay, and is neither reset nor stepped.
     """
 
+    learns_from_logs: ClassVar[bool] = True
     learns_online: ClassVar[bool] = False
 
     def learn(self: SelfOffline, *args: Any, **kwargs: Any) -> SelfOffline:
@@ -56,7 +57,7 @@ class OfflineAlgorithm(DelayedSAC):
             )
             self.replay_buffer = self._new_replay_buffer()
             self.num_timesteps = 0  # counted updates of learn_offline
-        elif self._n_updates == 0 and self.replay_buffer.size() == 0:  # as of one that was saved since
+        elif self.trained_ages is None and self.replay_buffer.size() == 0:  # as of one that was saved since
             self.num_timesteps = 0
         return super().learn(*args, **kwargs)
 

@@ -75,6 +75,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
     }
     counters = (*SafeSaveMixin.counters, "trained_ages")
     own_classes = (DelayedReplayBuffer,)
+    learns_from_logs: ClassVar[bool] = False
     policy: DelayedSACPolicy
     replay_buffer: DelayedReplayBuffer
     _left_at: list[tuple[int, int]] | None = None  # what Monitors of a task without delay had counted
@@ -383,14 +384,20 @@ class DelayedSAC(SafeSaveMixin, SAC):
         :param path: of the file, with or without the ``.pkl`` that SB3's callbacks give it, or a binary file object
         :param truncate_last_traj: of SB3's ``HerReplayBuffer``, without effect here
         :raises SavedFileError: when the file is no replay, is damaged or forged, or was made with another task,
-            ``buffer_size`` or ``n_envs``
+            ``buffer_size`` or ``n_envs``, or of logs that this algorithm does not learn from
         """
         found = existing(path, ".pkl")  # type: ignore[arg-type]  # io.BufferedIOBase is IO
         state = load_tree(found)
-        replay = self._new_replay_buffer() if self.replay_buffer is None else self.replay_buffer
+        replay = self.replay_buffer
         with readable(found, explained=(ValueError,)):
             if state["holds_logs"] is True:  # however long they are
+                if not self.learns_from_logs:
+                    raise ValueError(
+                        f"It holds logs, from which {type(self).__name__} does not learn; SAID, BC and DQL do"
+                    )
                 replay = self._new_replay_buffer(rows_for_logs(len(state["rewards"]), self.policy.max_delay), n_envs=1)
+            elif replay is None or replay.holds_logs:  # which are no longer than they have to be
+                replay = self._new_replay_buffer()
             replay.load_state_dict(state)
         self.replay_buffer, replay.device = replay, self.device
 

@@ -77,6 +77,15 @@ def test_held_delay_updates_at_a_phase_of_its_own_in_each_episode():
     assert set(phases) == {0, 1, 2, 3}
 
 
+def test_a_total_that_is_one_for_an_episode_is_drawn_anew_by_what_holds_it():
+    held = [
+        draw_packets(HeldDelay(process, 0.8), N) for process in ((2, 5), TotalDelay((0, 3), 2), TotalDelay(2, (0, 3)))
+    ]
+    for delays in held:
+        assert set(delays) == {2, 3, 4, 5}
+    np.testing.assert_array_equal(held[0], held[1])  # the same draws
+
+
 def test_held_losses_come_in_bursts():
     delays = draw_packets(HeldDelay(DroppedPackets(2, p=0.25), hold_prob=0.9), N)
     lost = delays == -1

@@ -1,6 +1,7 @@
 """The delay of a logged system: exact on four tasks at delays 0..16, its meaning under jitter, and what is refused."""
 
 import functools
+import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -249,3 +250,15 @@ def test_what_is_refused(observations, actions, reason):
 def test_bad_arguments_are_refused(kwargs):
     with pytest.raises(ValueError, match="max_delay is >= 0 and n_resamples >= 1"):
         estimate_delay([STATES], [ACTIONS], **kwargs)
+
+
+def test_a_delay_beyond_those_tried_is_warned_of():
+    """Actions that resemble each other point at the largest age that is tried, and with full confidence."""
+    episodes = play("HalfCheetah-v5", "ou")
+    late = delayed(episodes, FixedDelay(11))[:2]
+    with pytest.warns(UserWarning, match=r"10, is the largest that was tried, and the true one may be larger"):
+        found = estimate_delay(*late, max_delay=10)
+    assert found.delay == 10
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert estimate_delay(*late).delay == 11

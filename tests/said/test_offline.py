@@ -11,7 +11,7 @@ from small_task import delayed
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_said import SAID, PlannerConfig
+from sb3_said import SAID, PlannerConfig, StableSAC
 from sb3_said.files.archive import SavedFileError
 from sb3_said.offline import IQL, Dataset, IQLConfig
 from sb3_said.said.policies import SAIDPolicy
@@ -199,6 +199,29 @@ def test_a_replay_of_logs_is_known_as_such_from_its_file_too(tmp_path):
     with pytest.warns(UserWarning, match="no longer holds the dataset"):
         loaded.learn(60, reset_num_timesteps=False)
     assert loaded.num_timesteps == loaded.replay_buffer.size() == 60
+
+
+@pytest.mark.parametrize("n_steps", [30, 200])  # fewer than the log has, and more
+def test_a_replay_of_own_steps_takes_the_place_of_logs_at_its_own_size(n_steps, tmp_path):
+    make().learn(n_steps).save_replay_buffer(tmp_path / "replay")
+    model = learn(steps=2)
+    model.load_replay_buffer(tmp_path / "replay")
+    replay = model.replay_buffer
+    assert (replay.size(), replay.buffer_size, replay.holds_logs) == (n_steps, model.buffer_size, False)
+
+
+def test_what_learns_from_its_own_steps_alone_takes_no_logs(tmp_path):
+    learn(steps=2).save_replay_buffer(tmp_path / "replay")
+    with pytest.raises(SavedFileError, match="holds logs, from which StableSAC does not learn; SAID, BC and DQL do"):
+        make(cls=StableSAC).load_replay_buffer(tmp_path / "replay")
+
+
+def test_steps_of_an_agent_that_was_saved_before_its_first_update_count(tmp_path):
+    """Those of logs are updates, and do not."""
+    for model, n_steps in ((make(learning_starts=100).learn(30), 30), (learn(steps=2), 0)):
+        model.save(tmp_path / "agent")
+        loaded = SAID.load(tmp_path / "agent", env=delayed(), device="cpu")
+        assert loaded.learn(10, reset_num_timesteps=False).num_timesteps == n_steps + 10
 
 
 def test_an_expert_that_has_learned_nothing_is_not_let_answer():
