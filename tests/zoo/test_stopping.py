@@ -217,7 +217,6 @@ def test_environments_processes_ignore_ctrl_c_and_the_training_does_not(tmp_path
     told = """
 from multiprocessing import get_context
 from signal import SIGINT, default_int_handler, getsignal, signal
-from sb3_said.zoo.runs import load_run
 from sb3_said.zoo.stopping import shield
 if __name__ == "__main__":
     signal(SIGINT, default_int_handler)  # which a background job of a shell ignores
