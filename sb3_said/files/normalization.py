@@ -28,6 +28,16 @@ def save_normalization(path: Path, vec_normalize: VecNormalize) -> None:
     save_tree(path, {"settings": settings, "statistics": get_statistics(vec_normalize)}, kind=KIND)
 
 
+def normalizes_observations(path: Path) -> bool:
+    """Return whether a file of :func:`save_normalization` changes observations, or rewards alone.
+
+    :raises SavedFileError: if the file is damaged or forged
+    """
+    saved = load_tree(path, KIND)
+    with readable(path):
+        return saved["settings"]["norm_obs"] is not False
+
+
 def load_normalization(path: Path, venv: VecEnv, training: bool = False) -> VecNormalize:
     """Normalise environments as :func:`save_normalization` was told, running no code from the file.
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+import warnings
 from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from sb3_said.files.archive import load_metadata
+from sb3_said.files.archive import SavedFileError, load_metadata
 from sb3_said.files.atomic import remove_abandoned
-from sb3_said.files.normalization import normalization_file
+from sb3_said.files.normalization import normalization_file, normalizes_observations
 from sb3_said.zoo.answer import BEST_NAME, EXPERT_FOLDER
 from sb3_said.zoo.record import RECORD_NAME, Record
 
@@ -98,9 +99,30 @@ def find_agent(path: Path) -> tuple[Path, Record | None]:
 def find_normalization(file: Path, record: Record | None) -> Path | None:
     """Return where an agent's statistics of ``VecNormalize`` are, None without.
 
+    Statistics of observations beside an agent that was taught on observations as they are belonged to another one of
+    its name: they are left out, with a warning.
+
     :param file: of the agent; this and the next as :func:`find_agent` returns them
+    :raises SavedFileError: where the statistics cannot be read
     """
     agents = [file]
     if record is not None:  # rl_zoo3's checkpoints (--save-freq) have none of their own
         agents.append(file.with_name(record.agent_name))
-    return next((path for path in map(normalization_file, agents) if path.is_file()), None)
+    found = next((path for path in map(normalization_file, agents) if path.is_file()), None)
+    if found is None or not (_reads_them_as_they_are(file) and normalizes_observations(found)):
+        return found
+    warnings.warn(
+        f"{found} is left out: {file} learned of observations as they are, so it belonged to another agent of that "
+        "name. Delete it.",
+        stacklevel=2,
+    )
+    return None
+
+
+def _reads_them_as_they_are(agent: Path) -> bool:
+    """Return whether an agent's file says that no ``VecNormalize`` changed its observations."""
+    try:
+        told = load_metadata(agent)["metadata"]
+    except SavedFileError:  # an agent of SB3's own
+        return False
+    return isinstance(told, dict) and told.get("reads_normalized") is False

@@ -16,10 +16,11 @@ pytest.importorskip("rl_zoo3")
 
 import torch as th
 from small_run import ENV, TINY_PLANNER, write_run
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.evaluation import collect_observations
-from sb3_said.files.normalization import normalization_file
+from sb3_said.files.normalization import normalization_file, save_normalization
 from sb3_said.zoo import decide, evaluate
 from sb3_said.zoo.answer import EXPERT_FOLDER
 from sb3_said.zoo.record import Record
@@ -88,14 +89,16 @@ def test_who_answers_is_set_and_shown(run: Path, tmp_path: Path, capsys: pytest.
     assert load(newer).policy.expert_ages == range(2)
 
 
-def test_statistics_of_normalised_observations_go_with_the_file(run: Path, tmp_path: Path) -> None:
+def test_statistics_of_vec_normalize_go_with_the_file(run: Path, tmp_path: Path) -> None:
     source = tmp_path / "agent.zip"
     source.write_bytes((run / f"{ENV}.zip").read_bytes())
-    normalization_file(source).write_bytes(b"statistics")
+    env = DummyVecEnv([lambda: DelayedObservationWrapper(gym.make(ENV), 2)])
+    save_normalization(normalization_file(source), VecNormalize(env, norm_obs=False))
+    statistics = normalization_file(source).read_bytes()
     decide.main([str(source), "--compact", "-o", str(tmp_path / "elsewhere" / "small.zip")])
-    assert normalization_file(tmp_path / "elsewhere" / "small.zip").read_bytes() == b"statistics"
+    assert normalization_file(tmp_path / "elsewhere" / "small.zip").read_bytes() == statistics
     decide.main([str(source), "--compact", "-o", str(source)])  # in place
-    assert normalization_file(source).read_bytes() == b"statistics"
+    assert normalization_file(source).read_bytes() == statistics
     decide.main([str(run), "--compact", "-o", str(source)])  # another agent takes the name, and has none
     assert not normalization_file(source).exists()
 

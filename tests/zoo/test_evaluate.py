@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import warnings
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -134,6 +135,21 @@ def test_an_agent_that_reads_normalised_observations_is_not_played_without_their
             load_run(file, "sadr", ENV, device="cpu")
         save_normalization(normalization_file(file), env)
         assert load_run(file, "sadr", ENV, device="cpu").normalize is not None
+
+
+def test_statistics_that_belonged_to_another_agent_of_the_name_are_left_out(run: Path, tmp_path: Path) -> None:
+    agent = tmp_path / "agent.zip"
+    agent.write_bytes((run / f"{ENV}.zip").read_bytes())
+    for norm_obs in (True, False):
+        keys = ["observation"] if norm_obs else None
+        env = VecNormalize(
+            DummyVecEnv([lambda: DelayedObservationWrapper(gym.make(ENV), 1)]), norm_obs=norm_obs, norm_obs_keys=keys
+        )
+        save_normalization(normalization_file(agent), env)
+        told = pytest.warns(UserWarning, match="belonged to another agent")
+        with told if norm_obs else nullcontext():
+            normalize = load_run(agent, "said", ENV, device="cpu").normalize
+        assert (normalize is None) == norm_obs  # those of rewards alone are its own, and change no observation
 
 
 def test_results_of_another_file_are_kept_apart(run: Path, tmp_path: Path) -> None:
