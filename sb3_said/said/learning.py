@@ -107,7 +107,7 @@ class PlannerLearner(OfflineAlgorithm):
         :param make_trial_env: makes a number of environments like the training's, as ``lambda n: make_vec_env(make,
             n)``. The trial plays in them at once, which is faster (results/settings.md); without it, or where it fails,
             in the training's own
-        :raises KeyboardInterrupt: when ``should_stop`` has ended the training
+        :raises KeyboardInterrupt: when ``should_stop`` asks for the end
         :raises ValueError: for an interval below 1, when the buffer is empty, or the checkpoint is of a training with
             other settings
         :raises FloatingPointError: when an update was not finite
@@ -157,7 +157,8 @@ class PlannerLearner(OfflineAlgorithm):
                 training.log(
                     let_the_best_answer(self, n_episodes, progress_bar, should_stop, planners[1:], make_trial_env)
                 )
-        if outcome == "stopped":
+        # The latter where the same Ctrl-C came again, amid an update or the trial
+        if outcome == "stopped" or (should_stop is not None and should_stop()):
             raise KeyboardInterrupt
         self._planner_trained_at = self.num_timesteps
 

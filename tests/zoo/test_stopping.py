@@ -129,8 +129,10 @@ def test_a_signal_to_the_planners_training_loses_no_update(
 
 
 @pytest.mark.parametrize("where", [(StableSAC, "train", 10), (PlannerTrainer, "step", 7)], ids=["expert", "planner"])
+@pytest.mark.parametrize("times", [1, 2], ids=["once", "twice"])
 def test_a_run_that_is_trained_for_longer_keeps_its_planner_until_it_has_another(
     where: tuple[type, str, int],
+    times: int,
     whole: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -138,7 +140,8 @@ def test_a_run_that_is_trained_for_longer_keeps_its_planner_until_it_has_another
 ) -> None:
     run = Path(shutil.copytree(whole, tmp_path / "run"))
     with monkeypatch.context() as patch:
-        signal_at(patch, *where, signal.SIGINT)
+        for _ in range(times):
+            signal_at(patch, *where, signal.SIGINT)
         with pytest.raises(SystemExit):
             train.main(["--resume", str(run), "-n", "200"])
     assert f"{ENV}.zip stays as it was, with its planner" in capsys.readouterr().out and same(run, whole)
