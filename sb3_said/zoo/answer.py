@@ -36,6 +36,7 @@ def evaluate_answer(model: SAID, like: EvalCallback, folder: Path, stopping: Sto
         if stopping.is_asked:
             raise KeyboardInterrupt
 
+    like.eval_env.seed(model.seed)  # a run that goes on after a stop plays the episodes of one that was not stopped
     played: Any = evaluate_policy(
         model, like.eval_env, like.n_eval_episodes, like.deterministic, callback=on_step, return_episode_rewards=True
     )

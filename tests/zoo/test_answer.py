@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -18,7 +19,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.monitor import Monitor
 from trained_run import ENV, PLANNER, train_run
 
-from sb3_said import SAID
+from sb3_said import SAID, DelayedObservationWrapper
 from sb3_said.evaluation.plots import plot_learning_curve
 from sb3_said.zoo.answer import evaluate_answer
 from sb3_said.zoo.stopping import Stopping
@@ -99,6 +100,24 @@ def test_a_later_planner_is_added_and_the_best_is_kept(tmp_path: Path, monkeypat
     assert kept == [100, 100, 300, 300]
     rows = returns_of(tmp_path / "evaluations.npz")
     assert {step: np.mean(row) for step, row in rows.items() if step} == {100: 5.0, 200: 4.0, 300: 1.0}
+
+
+def test_the_episodes_are_the_same_whatever_was_evaluated_before(tmp_path: Path) -> None:
+    """As a run that goes on after a stop has new environments."""
+
+    def evaluation() -> EvalCallback:
+        return EvalCallback(Monitor(DelayedObservationWrapper(gym.make("Pendulum-v1"), 1)), n_eval_episodes=2)
+
+    used = evaluation()
+    model = small_agent.make(used.eval_env, seed=3)
+    model.set_logger(Logger(None, []))
+    for steps, like in ((100, used), (200, used), (300, evaluation())):
+        model.num_timesteps = steps
+        evaluate_answer(model, like, tmp_path, Stopping())
+    rows = returns_of(tmp_path / "evaluations.npz")
+    assert rows[100][0] != rows[100][1]
+    np.testing.assert_array_equal(rows[200], rows[100])
+    np.testing.assert_array_equal(rows[300], rows[100])
 
 
 def test_an_evaluation_can_be_stopped(tmp_path: Path) -> None:
