@@ -117,7 +117,10 @@ def test_an_agent_that_reads_other_states_is_refused(files, tmp_path):
     shutil.copytree(actor, tmp_path / "actor-v0")
     env = DummyVecEnv([lambda: DelayedObservationWrapper(gym.make(ENV), 0)])
     statistics = VecNormalize(env, norm_obs_keys=["observation"])
-    save_normalization(normalization_file(tmp_path / "actor-v0" / f"{ENV}.zip"), statistics)
+    file = tmp_path / "actor-v0" / f"{ENV}.zip"
+    (agent := DelayedSAC.load(file, device="cpu")).reads_normalized = True
+    agent.save(file)
+    save_normalization(normalization_file(file), statistics)
     words = "--dataset", str(log), "--json", str(tmp_path / "lost.json"), "--actor", str(tmp_path / "actor-v0")
     with pytest.raises(SystemExit, match="actor-v0 was trained under VecNormalize, which is not applied here"):
         script.main([str(said), *words])
