@@ -157,7 +157,7 @@ class PlannerLearner(OfflineAlgorithm):
                 training.log(
                     let_the_best_answer(self, n_episodes, progress_bar, should_stop, planners[1:], make_trial_env)
                 )
-        # The latter where the same Ctrl-C came again, amid an update or the trial
+        # The latter where the same Ctrl-C came again, amid the trial
         if outcome == "stopped" or (should_stop is not None and should_stop()):
             raise KeyboardInterrupt
         self._planner_trained_at = self.num_timesteps

@@ -88,7 +88,7 @@ class PlannerTraining:
         :param should_stop: asked after every update; where it says so, a checkpoint is written and the training ends;
             none of the first guess, which takes minutes
         :param on_step: called with the number of updates made after each; the training ends when it returns False
-        :return: ``"interrupted"`` after Ctrl-C, ``"stopped"`` by ``should_stop``
+        :return: ``"interrupted"`` after Ctrl-C, ``"stopped"`` where ``should_stop`` asked for the end
         """
         trainer, total = self.trainer, self.trainer.gradient_steps
         outcome: Literal["done", "interrupted", "stopped"] = "done"
@@ -115,7 +115,7 @@ class PlannerTraining:
             else:
                 outcome = "stopped"
         except KeyboardInterrupt:
-            outcome = "interrupted"
+            outcome = "stopped" if should_stop is not None and should_stop() else "interrupted"
             result = "keeps what it learned" if trainer.n_updates > 0 else "stays as it was"
             result = result if self.is_agents else "is left out, and no trial is played"
             print(f"Training of the {self.name} interrupted after {trainer.n_updates} of {total} updates; it {result}.")

@@ -1,6 +1,7 @@
 """SAID from logs: no environment, values of its own, and the same files, callbacks and resumes as online."""
 
 import warnings
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_said import SAID, PlannerConfig, StableSAC
 from sb3_said.files.archive import SavedFileError
 from sb3_said.offline import IQL, Dataset, IQLConfig
+from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.said.policies import SAIDPolicy
 from sb3_said.said.training import PlannerTraining
 
@@ -355,6 +357,30 @@ def test_callbacks_of_a_resumed_training_meet_the_planner(tmp_path):
     answered = []
     learn(folder=tmp_path, callback=lambda a, _: answered.append(a["self"].policy.who_answers) or True)
     assert answered[-1] == "planner" and "expert" not in answered[1:]  # but of the call before the first update
+
+
+@pytest.mark.parametrize("is_asked", [False, True])
+def test_a_ctrl_c_amid_an_update_ends_it_as_any_other_unless_it_came_twice(is_asked, monkeypatch):
+    step, asked, ended = PlannerTrainer.step, [], []
+
+    def interrupted(trainer):
+        if trainer.n_updates == 2:
+            asked.append(is_asked)
+            raise KeyboardInterrupt
+        step(trainer)
+
+    class End(BaseCallback):
+        def _on_step(self):
+            return True
+
+        def _on_training_end(self):
+            ended.append(True)
+
+    monkeypatch.setattr(PlannerTrainer, "step", interrupted)
+    model = make()
+    with pytest.raises(KeyboardInterrupt) if is_asked else nullcontext():
+        learn(model, callback=End(), should_stop=lambda: any(asked))
+    assert model.policy.planner_updates == 2 and ended == [True] * (not is_asked)
 
 
 def test_a_failed_training_changes_nothing(monkeypatch):
