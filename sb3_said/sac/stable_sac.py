@@ -80,6 +80,7 @@ class StableSAC(DelayedSAC):
         self.actor_averaging = actor_averaging
         self.critic_layer_norm = critic_layer_norm
         self._running_returns = np.zeros(1)  # (n_envs,) G_t of the episodes that are being played
+        self._paid = np.zeros(1)  # (n_envs,) the same, undiscounted and in the task's own rewards
         super().__init__(policy, env, learning_rate, ent_coef=ent_coef, target_entropy=target_entropy, **sac_kwargs)
 
     def _setup_model(self) -> None:
@@ -144,10 +145,18 @@ class StableSAC(DelayedSAC):
     ) -> None:
         is_stored = self._last_obs is not None  # else a callback has played at this very step
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)  # refuses what is NaN
-        if is_stored and self.policy.return_scale is not None:
-            begins = replay_buffer.steps[replay_buffer.pos - 1] == 0  # (n_envs,), as the replay saw it
+        if not is_stored:
+            return
+        row = replay_buffer.pos - 1
+        begins = replay_buffer.steps[row] == 0  # (n_envs,), as the replay saw it
+        if self.policy.return_scale is not None:
             self._running_returns = reward + self.gamma * np.where(begins, 0.0, self._running_returns)
             self.policy.return_scale.update(self._running_returns)
+        if self.policy.training_episodes is not None:
+            self._paid = replay_buffer.rewards[row] + np.where(begins, 0.0, self._paid)
+            for i in np.flatnonzero(dones):
+                if infos[i].get("episode") is None:  # no Monitor tells of it
+                    self.policy.training_episodes.add(float(self._paid[i]), int(replay_buffer.steps[row, i]) + 1)
 
     def _look_at_states(self) -> None:
         """Fit the z-scores to the states in replay, once there are a tenth more of them than last time.

@@ -1,12 +1,17 @@
 """Training episodes that have lost what was learned, and the average of StableSAC's actor, which waits for them."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch as th
+from gymnasium.wrappers import TimeLimit
 from hypothesis import given
 from hypothesis import strategies as st
 from small_agent import make
-from small_task import Drift, delayed
+from small_task import Drift, delayed, pendulum
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_said import SAID, StableSAC
 from sb3_said.sac.episodes import FORGETS, N_EPISODES, TrainingEpisodes
@@ -75,6 +80,29 @@ def test_training_counts_the_episodes_that_end():
     assert episodes.count == len(returns) == 12
     np.testing.assert_array_equal(episodes.newest, returns[-N_EPISODES:])
     assert episodes.first == pytest.approx(np.mean(returns[:10]))
+
+
+@pytest.mark.parametrize("scales", [False, True])
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_episodes_count_the_same_where_no_monitor_tells_of_them(n_envs, scales):
+    def counted(*wrappers):
+        def make_env():
+            env = pendulum(7)
+            for wrapper in wrappers:
+                env = wrapper(env)
+            return env
+
+        env = DummyVecEnv([make_env] * n_envs)
+        env = VecNormalize(env, norm_obs_keys=["observation"]) if scales else env
+        return make(env, cls=StableSAC).learn(150).policy.training_episodes
+
+    known, own = counted(Monitor), counted()
+    inside = counted(Monitor, partial(TimeLimit, max_episode_steps=5))  # whose Monitor sees no end
+    for found in (known, own, inside):
+        assert found.count == 150 // (5 if found is inside else 7) // n_envs * n_envs
+    for name, value in known.named_buffers():
+        th.testing.assert_close(getattr(own, name), value, rtol=0, atol=1e-5)  # a Monitor rounds to 6 digits
+    assert inside.newest.std() > 0
 
 
 @pytest.mark.parametrize(("decay", "waits"), [(0.5, True), (0.999, False)])
