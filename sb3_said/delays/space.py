@@ -194,16 +194,32 @@ def has_state_history(observation_space: spaces.Space[Any]) -> bool:
 def ages_of(env: Any) -> list[int]:
     """Return the ages that observations can have amid the episodes of an environment, [0] where nothing is delayed.
 
+    A simulator that hands out old observations by itself may say them as ``age_range``; else any may come.
+
     :param env: one environment, or an SB3 ``VecEnv`` of several that may have other delays; None has no delay
     """
-    # Asked for first: a missing attribute ends the workers of a SubprocVecEnv. A plain task may have one of its own.
-    if env is None or not isinstance(env.observation_space, spaces.Dict):
+    if env is None or not isinstance(env.observation_space, spaces.Dict):  # a plain task may have an age_range, too
         return [0]
-    if hasattr(env, "get_attr"):  # a VecEnv, which this room does not import
-        ranges = env.get_attr("age_range") if env.has_attr("age_range") else [(0, 0)]
-    else:
-        ranges = [env.get_wrapper_attr("age_range") if env.has_wrapper_attr("age_range") else (0, 0)]
+    if not has_attribute(env, "age_range"):
+        return [*range(check_spaces(env.observation_space, env.action_space).max_delay + 1)]
+    ranges = env.get_attr("age_range") if is_vectorised(env) else [env.get_wrapper_attr("age_range")]
     return sorted({age for low, high in ranges for age in range(low, high + 1)})
+
+
+def is_vectorised(env: Any) -> bool:
+    """Tell an SB3 ``VecEnv``, which this room does not import, from one environment."""
+    return hasattr(env, "get_attr")
+
+
+def has_attribute(env: Any, name: str) -> bool:
+    """Tell whether an environment, or each of a ``VecEnv``'s, has an attribute: none that cannot be asked has.
+
+    To be asked first: a missing attribute ends the workers of a ``SubprocVecEnv``.
+    """
+    try:
+        return env.has_attr(name) if is_vectorised(env) else env.has_wrapper_attr(name)
+    except NotImplementedError:  # of a simulator; SB3 takes an AttributeError for a no by itself
+        return False
 
 
 def check_one_max_delay(env: Any) -> None:
@@ -212,7 +228,8 @@ def check_one_max_delay(env: Any) -> None:
     :param env: as of :func:`ages_of`
     :raises ValueError: where the ``max_delay`` of an SB3 ``VecEnv``'s environments differ
     """
-    if hasattr(env, "get_attr") and isinstance(env.observation_space, spaces.Dict) and env.has_attr("max_delay"):
+    is_delayed = isinstance(env.observation_space, spaces.Dict)  # a plain task may have a max_delay of its own
+    if is_delayed and is_vectorised(env) and has_attribute(env, "max_delay"):
         largest = env.get_attr("max_delay")
         if len(set(largest)) > 1:
             raise ValueError(

@@ -16,7 +16,7 @@ from stable_baselines3.common.utils import configure_logger
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_said.delays.receivers import Actuator, NewestPacket
-from sb3_said.delays.space import ages_of
+from sb3_said.delays.space import ages_of, has_attribute
 from sb3_said.offline.datasets import Dataset, load_dataset
 from sb3_said.planner.checks import check_intervals
 from sb3_said.sac import DelayedSAC
@@ -162,7 +162,7 @@ class OfflineAlgorithm(DelayedSAC):
     def _draw_ages(self) -> Callable[[int], np.ndarray] | None:
         """Return how to draw the ages of an episode, as its environment's receiver and actuator do in play."""
         is_delayed = isinstance(self.observation_space, spaces.Dict)
-        if self.env is None or not is_delayed or not self.env.has_attr("age_range"):
+        if self.env is None or not is_delayed or not has_attribute(self.env, "make_receivers"):
             return None
         made = self.env.env_method("make_receivers")  # of environments whose delays may differ
         rng = np.random.default_rng(self.seed)

@@ -27,7 +27,14 @@ from stable_baselines3.common.vec_env import (
     unwrap_vec_wrapper,
 )
 
-from sb3_said.delays.space import WRAPPER_ORDER, ages_of, check_one_max_delay, check_spaces, written_ages
+from sb3_said.delays.space import (
+    WRAPPER_ORDER,
+    ages_of,
+    check_one_max_delay,
+    check_spaces,
+    has_attribute,
+    written_ages,
+)
 from sb3_said.delays.wrapper import DelayedObservationWrapper
 from sb3_said.files.agents import SafeSaveMixin, existing, with_suffix
 from sb3_said.files.archive import load_tree, readable, save_tree
@@ -150,7 +157,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
         env = None if self.env is None else self.env.unwrapped
         if isinstance(env, DummyVecEnv) and env.envs[0].spec is not None:
             self.task = env.envs[0].spec.id
-        elif env is not None and _has_attr(env, "task_id"):
+        elif env is not None and has_attribute(env, "task_id"):
             found = env.get_attr("task_id", 0)[0]  # of a wrapper of ours; a task may mean something else by it
             self.task = found if isinstance(found, str) else self.task
 
@@ -199,7 +206,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
     def _are_at(self, obs: np.ndarray | dict[str, np.ndarray]) -> bool:
         """Tell whether the environments handed out these observations last, and nobody has played them since."""
         assert self.env is not None
-        if not isinstance(obs, dict) or not _has_attr(self.env, "handed_out"):
+        if not isinstance(obs, dict) or not has_attribute(self.env, "handed_out"):
             return self._left_at is not None and self._left_at == self._steps_counted()
         last = self.env.get_attr("handed_out")
         return all(np.array_equal(obs[key][i], part) for i, parts in enumerate(last) for key, part in parts.items())
@@ -400,14 +407,6 @@ class DelayedSAC(SafeSaveMixin, SAC):
                 replay = self._new_replay_buffer()
             replay.load_state_dict(state)
         self.replay_buffer, replay.device = replay, self.device
-
-
-def _has_attr(env: VecEnv, name: str) -> bool:
-    """Tell whether the environments have an attribute: none of those that cannot be asked has."""
-    try:
-        return env.has_attr(name)
-    except NotImplementedError:  # of a simulator; SB3 takes an AttributeError for a no by itself
-        return False
 
 
 def _are_wrapped(env: VecEnv, wrapper: type[gym.Wrapper[Any, Any, Any, Any]]) -> list[bool]:

@@ -9,7 +9,7 @@ import pytest
 from counting_task import OBS_DIM, CountingTask
 from gymnasium import spaces
 from gymnasium.wrappers import ClipAction, FlattenObservation, FrameStackObservation, TransformAction
-from small_task import Drift, LateDelay, OwnDelay, delayed
+from small_task import Drift, LateDelay, LateSimulator, OwnDelay, TellingSimulator, delayed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from stable_baselines3.sac.policies import SACPolicy
 
@@ -215,6 +215,8 @@ def test_a_delayed_task_tells_its_states_and_its_largest_delay(delay, max_delay,
         (delayed(TotalDelay(1, 1)), [2]),
         (delayed(OwnDelay()), [0, 1, 2]),  # does not say its smallest
         (delayed(LateDelay()), [1, 2]),
+        (LateSimulator(), [0, 1, 2]),  # does not say either
+        (TellingSimulator(), [2]),
     ],
     ids=str,
 )

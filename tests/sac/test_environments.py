@@ -9,7 +9,7 @@ import pytest
 from gymnasium import spaces
 from sb3_contrib.common.wrappers import TimeFeatureWrapper
 from small_agent import make as make_agent
-from small_task import Drift, LateDelay, OwnDelay, Simulator, delayed
+from small_task import Drift, LateDelay, LateSimulator, OwnDelay, Simulator, delayed
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.torch_layers import CombinedExtractor
@@ -41,18 +41,20 @@ def test_environments_in_processes_of_their_own(make_env, ages):
         vec.close()
 
 
+@pytest.mark.parametrize("task", [Drift, LateSimulator])
 @pytest.mark.parametrize("error", [NotImplementedError, AttributeError])
-def test_a_simulator_that_knows_no_wrappers_is_taken(error, monkeypatch):
+def test_a_simulator_that_knows_no_wrappers_is_taken(error, task, monkeypatch):
     """As those whose environments are computed side by side on a GPU."""
 
     def refuse(*_):
         raise error("Asking an environment is not supported.")
 
-    env = DummyVecEnv([Drift, Drift])
+    env = DummyVecEnv([task, task])
     monkeypatch.setattr(env, "env_is_wrapped", refuse)
     monkeypatch.setattr(env, "get_attr", refuse)
     model = make(env).learn(20)
     assert model.learn(20, reset_num_timesteps=False).num_timesteps == 40
+    assert model.trained_ages == ([0] if task is Drift else [0, 1, 2])
 
 
 def test_a_normalised_environment_is_taken():

@@ -56,3 +56,23 @@ class Simulator(Drift):
     """A plain task whose ``process`` is no delay."""
 
     process = "a program"
+
+
+class LateSimulator(gym.Env):
+    """A task that hands out old observations by itself, under the wrapper's keys."""
+
+    def __init__(self, delay=2):
+        self._own = delayed(delay)
+        self.observation_space, self.action_space = self._own.observation_space, self._own.action_space
+
+    def reset(self, *, seed=None, options=None):
+        return self._own.reset(seed=seed)
+
+    def step(self, action):
+        return self._own.step(action)
+
+
+class TellingSimulator(LateSimulator):
+    """The same, and it tells the ages."""
+
+    age_range = (2, 2)
