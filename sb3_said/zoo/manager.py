@@ -32,6 +32,7 @@ from sb3_said.files.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallbac
 from sb3_said.files.normalization import load_normalization, normalization_file, save_normalization
 from sb3_said.offline import BC, DQL, OfflineAlgorithm
 from sb3_said.offline.datasets import is_file
+from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.zoo.answer import BEST_NAME, EXPERT_FOLDER, evaluate_answer, save_with_normalization
 from sb3_said.zoo.arguments import Delay, ending_training, largest_delay
 from sb3_said.zoo.folder import (
@@ -135,7 +136,7 @@ class DelayedExperimentManager(ExperimentManager):
         self._has_told = False  # that there is no delay
         self.lock: FileLock | None = None
         self._uuid = zoo_kwargs.get("uuid_str", "")
-        given = self.custom_hyperparams or {}
+        self._given = given = self.custom_hyperparams or {}
         if run.resume is not None and run.record is not None:
             if (evaluates := run.record.options.get("eval_freq", 1) > 0) != (self.eval_freq > 0):
                 raise ValueError(
@@ -153,9 +154,8 @@ class DelayedExperimentManager(ExperimentManager):
             self.eval_env_kwargs = {**run.record.eval_env_kwargs, **given_eval}
         else:
             overrides = preset_overrides(self.config, run.preset, env_id, run.delay, run.max_delay, run.dataset)
-            if (
-                run.expert_delay is not None
-            ):  # whose environment would tell who is better there, and not under the other
+            # A trial in the expert's environment would tell who is better there, and not under the planner's delay
+            if run.expert_delay is not None:
                 overrides["planner_trial_episodes"] = 0
             self.custom_hyperparams = with_given({**overrides, **ALGORITHMS[algo][1]}, given, NESTED)
 
@@ -350,6 +350,11 @@ class DelayedExperimentManager(ExperimentManager):
             with ending_training(SavedFileError):
                 callbacks = CallbackList(self.callbacks)
                 restore_training(model, self.checkpoint, callbacks)  # type: ignore[arg-type]  # one of ALGORITHMS
+            if isinstance(model, SAID):
+                with ending_training(ValueError):
+                    # Where a trial has chosen among ways, what the run began with is none of them
+                    said = self._given if model.planner_ways else self.custom_hyperparams or {}
+                    _decide_as_given(model, said.get("planner_kwargs", {}))
             print(f"Resuming {self.save_path} at step {model.num_timesteps}")
             drop_undone_episodes(self.checkpoint)
         if self.run.record is not None:
@@ -446,6 +451,17 @@ class SaveNormalization(BaseCallback):
         if (vec_normalize := self.model.get_vec_normalize_env()) is not None:
             save_normalization(self.path, vec_normalize)
         return True
+
+
+def _decide_as_given(model: SAID, given: dict[str, Any]) -> None:
+    """Take what a command says of how to decide over what its checkpoint does, whose planner stays.
+
+    :raises ValueError: for the ``mask`` of another planner
+    """
+    own = model.planner_kwargs["mask"]
+    if given.get("mask", own) != own:
+        raise ValueError(f"--resume goes on with mask={own!r}, as its planner was trained, got {given['mask']!r}.")
+    model.set_planner(**{name: value for name, value in given.items() if name in SAMPLING_SETTINGS})
 
 
 def has_its_planner(model: SAID) -> bool:

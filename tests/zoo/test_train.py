@@ -215,6 +215,21 @@ def test_a_resume_keeps_what_it_is_not_told_to_change(tmp_path: Path) -> None:
     assert Record.read(run).options["n_timesteps"] == 80
 
 
+def test_a_resume_says_how_a_planner_of_its_checkpoint_decides(tmp_path: Path) -> None:
+    train.main([*arguments(tmp_path), "planner_train_freq:100", "planner_trial_episodes:0"])
+    run = run_of(tmp_path)
+    train.main(["--resume", str(run), "-params", "planner_kwargs:{'temperature': 3.0, 'n_candidates': 2}"])
+    for _ in range(2):  # and no other, as long as nothing else is said
+        planner = SAID.load(run / f"{ENV}.zip", device="cpu").planner_kwargs
+        assert (planner["temperature"], planner["n_candidates"], planner["depth"]) == (3.0, 2, 1)
+        train.main(["--resume", str(run), "-n", "240"])
+    before = {file: file.read_bytes() for file in run.iterdir() if file.is_file()}
+    other = "planner_kwargs:{'mask': 'own', 'present': 'inpainted'}"
+    with pytest.raises(SystemExit, match="goes on with mask='random', as its planner was trained, got 'own'"):
+        train.main(["--resume", str(run), "-n", "280", "-params", other])
+    assert {file: file.read_bytes() for file in run.iterdir() if file.is_file()} == before
+
+
 def test_a_resume_takes_no_setting_that_the_run_never_had(tmp_path: Path) -> None:
     """The YAML of a start is not kept, and a shipped one may have got more since."""
     own = {"n_timesteps": 60, "policy": "MlpPolicy", "learning_starts": 50}
