@@ -179,8 +179,8 @@ class PlannerLearner(OfflineAlgorithm):
         """Train the planner, and V(s) beside it, on logs of a task without delay (paper, Algorithm 2).
 
         No environment is stepped and no expert is trained; the planner serves every delay 0..D. Callbacks are called
-        after each update, and meet a planner that is at most 100 updates old. ``num_timesteps`` counts updates. From
-        the first on the planner answers, by plans.
+        after each update, and meet a planner that is at most 100 updates old, after the last one as it is.
+        ``num_timesteps`` counts updates. From the first on the planner answers, by plans.
 
         :param dataset: whatever :func:`~sb3_said.offline.load_dataset` reads; None for what ``take_dataset`` took
         :param gradient_steps: ``planner_gradient_steps`` by default
@@ -219,7 +219,8 @@ class PlannerLearner(OfflineAlgorithm):
 
         def on_step(n_updates: int) -> bool:
             self.num_timesteps = n_updates
-            if n_updates == first or n_updates % HAND_OVER_INTERVAL == 0:  # else an expert that learns nothing answers
+            # The first: else an expert that learns nothing answers
+            if n_updates in (first, total) or n_updates % HAND_OVER_INTERVAL == 0:
                 training.hand_over()
             return self._goes_on(watcher)
 

@@ -331,6 +331,12 @@ def test_callbacks_follow_each_update_meet_a_young_planner_and_can_end_it(monkey
     assert model.num_timesteps == model.policy.planner_updates == 5
 
 
+def test_callbacks_of_the_last_update_meet_the_trained_planner():
+    met = []
+    learn(steps=5, callback=lambda a, _: met.append(int(a["self"].policy.planner_updates)) or True)
+    assert met[-4:] == [1, 1, 1, 5]
+
+
 def test_a_resumed_training_ends_as_one_that_never_stopped(tmp_path):
     whole = weights(learn())
 
