@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 
+from sb3_said.sac import DelayedSAC
 from sb3_said.zoo.arguments import TRUST, add_run, check_positive, explained, make_parser, read_delay
 from sb3_said.zoo.runs import ANSWERS, LoadedRun, answering, load_run, longest_delay
 
@@ -195,6 +196,8 @@ def main(argv: list[str] | None = None) -> None:
         if args.beside_ignorant and not longest_delay(run.model):
             raise ValueError(f"--beside-ignorant needs an agent that is told an age; {args.run} knows no delay.")
         with answering(run.model, args.answer), closing(video) if video else nullcontext():
+            if args.beside_ignorant and isinstance(run.model, DelayedSAC):
+                run.model.check_ages([0])  # as it is told
             if not isinstance(video, SideBySide):
                 show(run, args, video, args.seed, args.episodes)
             else:

@@ -313,7 +313,8 @@ def obstacle(run: LoadedRun, answer: str | None, delay: int | str, age_error: in
         return f"it was built for delays 0..{longest}{added}"
     if answer not in (None, "expert"):
         try:
-            policy.planner.check_ages(list(range(low, high + 1)))  # type: ignore[union-attr,operator]  # of SAID
+            told = {min(max(age + error, 0), longest) for age in range(low, high + 1) for error in (0, age_error)}
+            policy.planner.check_ages(sorted(told))  # type: ignore[union-attr,operator]  # of SAID
         except ValueError as error:
             return str(error).removesuffix(".")
     return None

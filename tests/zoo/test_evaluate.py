@@ -381,8 +381,10 @@ def test_the_expert_of_a_planner_of_one_delay_is_watched_at_others(
     words = [str(tmp_path / "fixed.zip"), "--env", ENV, "--delay", "1", "--record", str(tmp_path / "film.gif")]
     enjoy.main([*words, "--answer", "expert"])
     assert shown == [("expert", 1)]
-    with pytest.raises(SystemExit):
-        enjoy.main([*words, "--answer", "planner"])
+    for refused in (["--answer", "planner"], ["--answer", "planner", "--delay", "2", "--beside-ignorant"]):
+        with pytest.raises(SystemExit):
+            enjoy.main([*words, *refused])
+    assert len(shown) == 1
 
 
 def test_an_agent_beside_itself_that_ignores_the_delay(

@@ -357,6 +357,9 @@ def test_a_planner_of_one_delay_plays_no_other(said: Path) -> None:
     assert found.pop(2) is None
     assert all(reason.startswith("A planner with mask='fixed' plans at age 2 only") for reason in found.values())
     assert over_delays.obstacle(run, "expert", 1) is None and over_delays.obstacle(run, "student", 1)
+    told = {error: over_delays.obstacle(run, "planner", 2, error) for error in (-2, -1, 0, 1)}
+    assert [error for error, reason in told.items() if reason is None] == [0, 1]  # cut at the largest
+    assert over_delays.obstacle(run, "expert", 2, -1) is None
 
 
 def test_the_expert_of_a_planner_of_one_delay_plays_all(said: Path, tmp_path: Path) -> None:
