@@ -72,7 +72,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
         metadata names the task, where it is a registered one.
 
         :param path: where to write; without a suffix, ``.zip`` is added. Or a binary file object.
-        :param compact: write matrices as float16 and no state of optimizers: two fifths of the size, to hand
+        :param compact: write matrices of weights as float16 and no state of optimizers: two fifths of the size, to hand
             on. Actions then differ in their last digits, and training goes on with fresh optimizers
         :raises ValueError: for spaces other than Box and Dict of Box
         """
@@ -105,7 +105,10 @@ class SafeSaveMixin(OffPolicyAlgorithm):
         if compact:
             parameters = tree["parameters"]
             tree["parameters"] = {name: {} if "optimizer" in name else part for name, part in parameters.items()}
-            tree["parameters"]["policy"] = {name: _in_half(value) for name, value in parameters["policy"].items()}
+            learned = {name for name, _ in self.policy.named_parameters()}
+            tree["parameters"]["policy"] = {
+                name: _in_half(value) if name in learned else value for name, value in parameters["policy"].items()
+            }
         metadata = {"task": self.task, "reads_normalized": self.reads_normalized}
         save_tree(with_suffix(path, ".zip"), tree, metadata, kind=type(self).__name__)
 
@@ -379,7 +382,7 @@ def _fitting_parameters(model: SafeSaveMixin, saved: dict[str, Any], exact: bool
 
 
 def _in_half(value: th.Tensor) -> th.Tensor:
-    """Return a matrix as float16, if it is one of float32 that stays finite; counts and statistics stay exact."""
+    """Return a matrix as float16, if it is one of float32 that stays finite."""
     half = value.half() if value.dtype == th.float32 and value.ndim > 1 else value
     return half if half.isfinite().all() else value
 

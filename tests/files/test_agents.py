@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch as th
 from saving import OwnPolicy, forge, make_policy, make_sac, same
+from small_agent import make as make_agent
 from small_task import delayed
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
@@ -370,6 +371,16 @@ def test_a_compact_file_is_smaller_and_acts_alike(tmp_path):
     np.testing.assert_allclose(*answers, atol=0.02)
     assert not np.array_equal(*answers)
     loaded.learn(10)
+
+
+def test_statistics_stay_whole_in_a_compact_file(tmp_path):
+    model = make_agent(planner_kwargs={"first_guess": "prior"}).learn(60)
+    model.save(tmp_path / "compact.zip", compact=True)
+    loaded, learned = SAID.load(tmp_path / "compact.zip", device="cpu"), dict(model.policy.named_parameters())
+    statistics = {name: value for name, value in model.policy.state_dict().items() if name not in learned}
+    assert any(value.ndim > 1 for value in statistics.values())
+    for name, value in statistics.items():
+        th.testing.assert_close(loaded.policy.state_dict()[name], value, rtol=0, atol=0)
 
 
 def test_what_is_too_large_for_half_precision_stays_whole(tmp_path):
