@@ -101,8 +101,9 @@ def rollout(
                 returns[episode] += float(reward)
                 lengths[episode] += 1
                 ended[episode] = terminated
-                changes[episode] += np.mean(np.abs(actions[row] - before.get(episode, actions[row])) / half_range)
-                before[episode] = np.array(actions[row])  # of a model that may write all its answers into one array
+                action = np.array(actions[row], np.float64)  # a copy: a model may write all its answers into one array
+                changes[episode] += np.mean(np.abs(action - before.get(episode, action)) / half_range)
+                before[episode] = action
                 if lengths[episode] == LONG and not (terminated or truncated):
                     warnings.warn(
                         f"Episode {episode} has not ended after {LONG:,} steps, and is waited for. If it need never "

@@ -135,6 +135,22 @@ def test_a_model_may_write_its_answers_into_one_array() -> None:
     np.testing.assert_allclose(rollout(Alternates(), lambda: Waves(False), 1, SEED).action_changes, 1 / 2 / 2)
 
 
+def test_how_rough_whole_numbers_are() -> None:
+    class Counts(Waves):
+        def __init__(self) -> None:
+            super().__init__(falls=False)
+            self.action_space = gym.spaces.Box(0, 10, (2,), np.uint8)
+
+    class Alternates:
+        t = 0
+
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            self.t += 1
+            return np.array([[self.t % 2, 4]], np.uint8), None  # whose difference of 0 and 1 would be 255
+
+    np.testing.assert_allclose(rollout(Alternates(), Counts, 1, SEED).action_changes, 1 / 5 / 2)
+
+
 def test_below_wrappers_that_change_rewards_a_monitor_counts_the_tasks_own() -> None:
     made = [lambda: gym.wrappers.TransformReward(Countdown(), lambda _: 7.0)]
     made.append(lambda: gym.wrappers.TransformReward(Monitor(Countdown()), lambda _: 7.0))
