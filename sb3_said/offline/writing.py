@@ -10,6 +10,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 
 from sb3_said.delays.space import check_spaces, unscale_action
 from sb3_said.files.atomic import check_writable, replacing
@@ -36,15 +37,30 @@ def check_target(target: str | os.PathLike[str]) -> None:
     name = os.fspath(target)
     if not name.rpartition("-v")[2].isdigit():
         raise ValueError(f"{name!r} is neither an .npz nor an id of Minari, which ends in its version: {name}-v0.")
-    minari = import_minari(f"{name} is no .npz, and")
+    import_minari(f"{name} is no .npz, and")
     from minari.dataset.minari_dataset import parse_dataset_id
+    from minari.storage.datasets_root_dir import get_dataset_path
 
     try:
         parse_dataset_id(name)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{name!r} is no id of a Minari dataset, such as hopper/mine-v0: {error}") from error
-    if name in minari.list_local_datasets():
-        raise ValueError(f"Minari has a dataset {name} already; give another name or version.")
+    if (folder := get_dataset_path(name)).exists():  # of an attempt that has failed, too
+        raise ValueError(f"{folder} is there already; give another name or version, or remove it.")
+
+
+def _without_code(spec: EnvSpec, target: str) -> EnvSpec | None:
+    """Return a registration that a file can hold: code by its name, and none, with a warning, where it has none."""
+    code = spec.entry_point
+    name = getattr(code, "__qualname__", "")
+    if name.isidentifier():  # so no lambda, and not inside of something
+        spec.entry_point = f"{code.__module__}:{name}"
+    try:
+        spec.to_json()
+    except (ValueError, TypeError) as error:
+        warnings.warn(f"{target} will not say its task: {error}", stacklevel=3)
+        return None
+    return spec
 
 
 def write_dataset(
@@ -83,6 +99,7 @@ def write_dataset(
     if spec is not None:  # what was registered, with the arguments that were given; its own lacks the time limit
         spec, kwargs = copy.deepcopy(gym.spec(spec.id)), spec.kwargs
         spec.kwargs = {**spec.kwargs, **kwargs}
+    told = None if spec is None else _without_code(spec, os.fspath(target))
     reference = reference_returns(spec.id) if spec is not None else None
     scores = {} if reference is None else {"ref_min_score": reference[0], "ref_max_score": reference[1]}
     buffers = []
@@ -104,7 +121,7 @@ def write_dataset(
         minari.create_dataset_from_buffers(
             os.fspath(target),
             buffers,
-            env=spec,
+            env=told,
             algorithm_name=algorithm,
             description=about,
             observation_space=state_space,

@@ -6,6 +6,7 @@ import json
 import sys
 import warnings
 from collections.abc import Iterator
+from contextlib import nullcontext
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.envs.registration import EnvSpec
 
 pytest.importorskip("rl_zoo3")
 
@@ -195,6 +197,33 @@ def own_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     yield "own_package"
     gym.registry.pop("Own-v0", None)
     sys.modules.pop("own_package", None)
+
+
+@pytest.mark.parametrize("is_named", [True, False])
+def test_a_task_that_is_registered_with_code_goes_into_minari(
+    is_named: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    minari = pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    monkeypatch.setitem(gym.registry, "Own-v0", EnvSpec("Own-v0", Drift if is_named else lambda: Drift()))
+    words = ["random", "--env", "Own-v0", "--steps", "40", "-o", "mine/own-v0"]
+    with nullcontext() if is_named else pytest.warns(UserWarning, match="mine/own-v0 will not say its task: Callable"):
+        collect.main(words)
+    spec = minari.load_dataset("mine/own-v0").spec.env_spec
+    assert (spec and spec.entry_point) == ("small_task:Drift" if is_named else None)
+    assert len(load_dataset("mine/own-v0", Drift.observation_space, Drift.action_space)) == 40
+
+
+def test_a_folder_of_minari_without_data_is_in_the_way(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    (tmp_path / "mine" / "log-v0" / "data").mkdir(parents=True)
+    monkeypatch.setattr(collect, "play", lambda *_: pytest.fail("it plays first"))
+    with pytest.raises(SystemExit):
+        collect.main([str(run), "-o", "mine/log-v0"])
+    assert f"{tmp_path / 'mine' / 'log-v0'} is there already" in capsys.readouterr().err
 
 
 def test_a_bar_that_is_not_shown_ends_it_too(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
