@@ -32,13 +32,14 @@ class OnnxModel:
         try:
             self._session = onnxruntime.InferenceSession(os.fspath(path), options, providers=["CPUExecutionProvider"])
             properties = self._session.get_modelmeta().custom_metadata_map
-            low, high = (np.array(json.loads(properties[name]), np.float32) for name in ("action_low", "action_high"))
+            dtype = np.dtype(properties.get("action_dtype", "float32"))  # files of before 2026-11-29 do not say
+            low, high = (np.array(json.loads(properties[name]), dtype) for name in ("action_low", "action_high"))
+            self.action_space = spaces.Box(low, high, dtype=dtype.type)
         except Exception as error:  # onnxruntime has many kinds
             raise ValueError(f"{path} is no file of sb3-said export, or damaged ({error}): export it again.") from error
         #: Whether it reads what VecNormalize has normalised; files of before 2026-11-26 do not say.
         self.reads_normalized = properties.get("reads_normalized") == "true"
         self._keys = [each.name for each in self._session.get_inputs()]
-        self.action_space = spaces.Box(low, high)
         state_space = spaces.Box(-np.inf, np.inf, (self._session.get_inputs()[0].shape[1],), np.float32)
         self.observation_space: spaces.Space[Any] = state_space
         if "delay" in self._keys:

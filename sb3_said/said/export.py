@@ -85,7 +85,8 @@ def to_onnx(model: SAID) -> Any:
     outputs = [helper.make_tensor_value_info("action", TensorProto.FLOAT, ["B", act_dim])]
     graph = helper.make_graph(nodes, "student", inputs, outputs, constants)
     made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
-    bounds = {"action_low": json.dumps(low.tolist()), "action_high": json.dumps(high.tolist())}
+    bounds = {"action_low": json.dumps(space.low.tolist()), "action_high": json.dumps(space.high.tolist())}
+    bounds["action_dtype"] = str(space.dtype)
     told = {"max_delay": str(max_delay), "reads_normalized": json.dumps(model.reads_normalized)}
     helper.set_model_props(made, told | bounds)
     onnx.checker.check_model(made)

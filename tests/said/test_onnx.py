@@ -11,6 +11,7 @@ from small_task import Drift, delayed
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from sb3_said import DelayedObservationWrapper
 from sb3_said.realtime import ControlLoop, OnnxModel
 from sb3_said.said.export import export
 
@@ -45,6 +46,24 @@ def test_it_answers_as_the_agent(max_delay, tmp_path):
     np.testing.assert_allclose(loaded.predict(obs)[0], wanted, rtol=1e-5, atol=1e-6)
     assert loaded.action_space == model.action_space
     assert loaded.observation_space == model.observation_space
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.float64])
+def test_a_loop_of_it_sends_actions_of_the_agents_kind(dtype, tmp_path):
+    class Levels(Drift):
+        action_space = spaces.Box(0, 200, (1,), dtype)
+
+    model = teach(make(DelayedObservationWrapper(Levels(), delay=2)))
+    export(model, tmp_path / "agent.onnx")
+    loaded = OnnxModel(tmp_path / "agent.onnx")
+    assert (loaded.action_space, loaded.observation_space) == (model.action_space, model.observation_space)
+    loops = [ControlLoop(each, 1, simulate=lambda seconds: 0) for each in (loaded, model)]
+    with model.policy.answering("student"):
+        for loop in loops:
+            loop.observe(np.ones(2), n_executed=0)
+        own, wanted = (loop.act(0) for loop in loops)
+    assert own.dtype == wanted.dtype == dtype
+    np.testing.assert_allclose(own, wanted, rtol=1e-5)
 
 
 def test_it_tells_that_it_reads_normalised_observations(tmp_path):
