@@ -355,9 +355,14 @@ def begin_worker(num_threads: int) -> None:
 def play(
     cell: Cell, env_id: str, episodes: int, seed: int, n_envs: int, device: str, gym_packages: list[str]
 ) -> Summary:
-    """Play the episodes of a cell."""
+    """Play the episodes of a cell.
+
+    :raises ValueError: where the agent's file is no longer what the cell says
+    """
     with at_any_age():
         run = load_run(cell.file, cell.algo, env_id, cell.delay, device, gym_packages=gym_packages, answer=cell.answer)
+        if digest_of(run) != cell.sha256:
+            raise ValueError(f"{cell.file} has changed since this call began: give the command again.")
         played = run.play(episodes, seed, n_envs, age_error=cell.age_error, answer=cell.answer)
     measured = played.terminated, played.action_changes
     return Summary.from_episodes(cell.agent, played.returns, played.lengths, None, *measured)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -369,6 +370,26 @@ def test_the_expert_of_a_planner_of_one_delay_plays_all(said: Path, tmp_path: Pa
     model.save(tmp_path / "fixed.zip")
     cells = by_cell(play(tmp_path / "out.json", [f"x={tmp_path / 'fixed.zip'}"], ["1", "2"], "--env", ENV))
     assert {name for name, result in cells.items() if result} == {("x planner", 2), ("x expert", 1), ("x expert", 2)}
+
+
+def test_an_agent_that_changes_amid_a_call_ends_it(
+    sadr: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, original = Path(shutil.copytree(sadr, tmp_path / "run")), over_delays.play
+
+    def trained_on(*args: Any) -> Any:
+        result = original(*args)
+        model: Any = load_run(run, device="cpu").model
+        model.num_timesteps += 1
+        model.save(run / f"{ENV}.zip")
+        return result
+
+    monkeypatch.setattr(over_delays, "play", trained_on)
+    with pytest.raises(SystemExit):
+        play(tmp_path / "out.json", [f"x={run}"], ["0", "1"])
+    assert f"{ENV}.zip has changed since this call began" in capsys.readouterr().err
+    (cell,) = json.loads((tmp_path / "out.json").read_text())["cells"]
+    assert cell["delay"] == 0  # of the file that it names
 
 
 def test_training_seeds_of_one_label_are_one_row(
