@@ -350,11 +350,11 @@ class DelayedExperimentManager(ExperimentManager):
             with ending_training(SavedFileError):
                 callbacks = CallbackList(self.callbacks)
                 restore_training(model, self.checkpoint, callbacks)  # type: ignore[arg-type]  # one of ALGORITHMS
-            if isinstance(model, SAID):
+            if isinstance(model, SAID) and model.policy.planner_is_trained:  # else it is made as was asked for
                 with ending_training(ValueError):
                     # Where a trial has chosen among ways, what the run began with is none of them
-                    said = self._given if model.planner_ways else self.custom_hyperparams or {}
-                    _decide_as_given(model, said.get("planner_kwargs", {}))
+                    asked = self._given if model.planner_ways else self.custom_hyperparams or {}
+                    _decide_as_given(model, asked.get("planner_kwargs", {}))
             print(f"Resuming {self.save_path} at step {model.num_timesteps}")
             drop_undone_episodes(self.checkpoint)
         if self.run.record is not None:

@@ -230,6 +230,20 @@ def test_a_resume_says_how_a_planner_of_its_checkpoint_decides(tmp_path: Path) -
     assert {file: file.read_bytes() for file in run.iterdir() if file.is_file()} == before
 
 
+def test_a_planner_that_lets_the_actor_decide_is_resumed_before_the_expert_has_learned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun = [*arguments(tmp_path)[:-2], TINY_PLANNER.replace(")", ",decided_by='actor')"), NETWORKS]
+    with monkeypatch.context() as patch:
+        patch.setattr(SAID, "train_planner", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(SystemExit, match="130"):  # as Ctrl-C
+            train.main([*begun, "-n", "60"])
+    assert not SAID.load(run_of(tmp_path) / f"{ENV}.zip", device="cpu").has_expert
+    train.main(["--resume", str(run_of(tmp_path)), "-n", "100"])
+    model = SAID.load(run_of(tmp_path) / f"{ENV}.zip", device="cpu")
+    assert model.has_expert and model.planner_kwargs["decided_by"] == "actor"
+
+
 def test_a_resume_takes_no_setting_that_the_run_never_had(tmp_path: Path) -> None:
     """The YAML of a start is not kept, and a shipped one may have got more since."""
     own = {"n_timesteps": 60, "policy": "MlpPolicy", "learning_starts": 50}
