@@ -6,7 +6,7 @@ import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,6 +34,8 @@ class Cell:
     """control steps, or a process as it was written"""
     algo: str
     file: str
+    """its path: absolute where the command line has it so, else from the working directory, and from the results'
+    folder within their file"""
     sha256: str
     """of the file, and of what its run changes in the task but the delay, if anything"""
     trained_steps: int
@@ -85,7 +87,7 @@ class Results:
             raise ValueError(f"{path} holds {found}, but {settings} is to be played: give another --json.")
 
     def ask(self, cells: list[Cell]) -> list[Cell]:
-        """Put these cells first, and fill in known results; drop cells of agents whose file has changed.
+        """Put these cells first and fill in what is known under any label; drop cells of agents whose file has changed.
 
         :return: those dropped
         """
@@ -93,8 +95,8 @@ class Results:
         for cell in cells:
             if cell.obstacle is None and cell.result is None and (old := known.get(cell.key)) is not None:
                 cell.origin, cell.result = old.origin, old.result
-        asked, agents = {cell.key for cell in cells}, {cell.lineage: cell.sha256 for cell in cells}
-        others = [cell for cell in self.cells if cell.key not in asked]
+        asked, agents = {(cell.agent, cell.key) for cell in cells}, {cell.lineage: cell.sha256 for cell in cells}
+        others = [cell for cell in self.cells if (cell.agent, cell.key) not in asked]
 
         def has_changed(cell: Cell) -> bool:
             return agents.get(cell.lineage, cell.sha256) != cell.sha256
@@ -128,8 +130,9 @@ class Results:
                 newest.ask(self._asked)
                 self.origins, self.cells = newest.origins, newest.cells
             yield
-            cells = [asdict(cell) for cell in self.cells if cell.result is not None or cell.obstacle is not None]
-            write_json(self.path, {**self.settings, "origins": self.origins, "cells": cells})
+            cells = [cell for cell in self.cells if cell.result is not None or cell.obstacle is not None]
+            written = [asdict(replace(cell, file=_moved(cell.file, to=self.path.parent))) for cell in cells]
+            write_json(self.path, {**self.settings, "origins": self.origins, "cells": written})
 
 
 def _read(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]], list[Cell]]:
@@ -137,10 +140,16 @@ def _read(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]], list[Cell]]
         document = json.loads(path.read_text())
         if {"env", "n_episodes", "seed"} <= set(document):
             origins, cells = document.pop("origins"), [Cell(**entry) for entry in document.pop("cells")]
+            cells = [replace(cell, file=_moved(cell.file, to=Path(), within=path.parent)) for cell in cells]
             return document, origins, cells
     except (ValueError, TypeError, KeyError, AttributeError):
         pass  # no JSON, or a number; cells of another version
     raise ValueError(f"{path} is no file of over-delays: give another --json.")
+
+
+def _moved(path: str, to: Path, within: Path = Path()) -> str:
+    """Return a path of one folder as it is from another; absolute ones stay."""
+    return path if os.path.isabs(path) else os.path.relpath(within / path, to)
 
 
 def make_table(cells: list[Cell], rows: Mapping[str, str]) -> Table:

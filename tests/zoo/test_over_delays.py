@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -26,7 +27,7 @@ from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.evaluation import Summary
 from sb3_said.offline.scores import REFERENCE_RETURNS
 from sb3_said.zoo import evaluate, over_delays
-from sb3_said.zoo.cells import Cell, average, manners_of, print_scores
+from sb3_said.zoo.cells import Cell, Results, average, manners_of, print_scores
 from sb3_said.zoo.record import Record
 from sb3_said.zoo.runs import load_run
 
@@ -155,7 +156,7 @@ def test_what_was_played_is_not_played_again(said: Path, sadr: Path, tmp_path: P
     assert len(rest) == 4 and file.read_bytes() == written
     # A delay and an agent are known however they are written, and a smaller call forgets nothing.
     part = play(file, [f"other={sadr}"], ["FixedDelay(1)"])
-    assert len(rest) == 4 and len(part["cells"]) == 9
+    assert len(rest) == 4 and len(part["cells"]) == 9 + 1
     assert by_cell(part)["other", 1] == document["cells"][-2]["result"]
     for written_so in ("UniformDelay(0, 1)", "UniformDelay(low=0,high=1)"):
         play(file, [sadr], [written_so])
@@ -258,14 +259,35 @@ def test_a_changed_agent_is_played_again(said: Path, tmp_path: Path, monkeypatch
     assert by_cell(new)["a expert", 0] == by_cell(old)["a expert", 0]
 
 
+def test_an_agent_by_another_label_stays_in_the_row_of_its_seeds(sadr: Path, tmp_path: Path) -> None:
+    other = write_run(tmp_path / "run", DelayedSAC, 1, seed=5)
+    seeds = play(tmp_path / "out.json", [f"both={sadr}", f"both={other}"], ["0"])
+    again = play(tmp_path / "out.json", [f"alone={other}"], ["0"])
+    alone, *both = again["cells"]
+    assert both == seeds["cells"] and alone == {**both[1], "agent": "alone"}
+
+
+def test_paths_are_of_the_results_folder_wherever_a_call_is_made(sadr: Path, tmp_path: Path, monkeypatch) -> None:
+    run, file = tmp_path / "logs" / "run", Path("results", "out.json")
+    monkeypatch.chdir(tmp_path)
+    for folder, seed in ((tmp_path, 5), (tmp_path / "logs", 6)):  # a run that goes on between two calls
+        write_run(run, DelayedSAC, 1, seed=seed)
+        monkeypatch.chdir(folder)
+        document = play(Path(os.path.relpath(tmp_path / file)), [f"a={os.path.relpath(run)}", f"b={sadr}"], ["0"])
+    paths = [Path(cell["file"]) for cell in document["cells"]]
+    assert paths == [Path("..", "logs", "run", f"{ENV}.zip"), sadr / f"{ENV}.zip"]  # an absolute one stays
+    assert Results(Path("..", file)).cells[0].file == str(Path("run", f"{ENV}.zip"))
+
+
 def test_an_agent_of_another_folder_is_no_changed_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both are named by the same relative path."""
-    file = tmp_path / "out.json"
-    for seed, label in enumerate(("first", "second")):
-        write_run(tmp_path / label / "run", DelayedSAC, 1, seed=seed)
-        monkeypatch.chdir(tmp_path / label)
-        document = play(file, [f"{label}=run"], ["0"])
-    assert [*by_cell(document)] == [("second", 0), ("first", 0)]
+    """Both are named by the same relative path, and may have the same label: then they are training seeds."""
+    for labels in (("first", "second"), ("same", "same")):
+        file = tmp_path / f"{labels[0]}.json"
+        for seed, label in enumerate(labels):
+            write_run(tmp_path / str(seed) / "run", DelayedSAC, 1, seed=seed)
+            monkeypatch.chdir(tmp_path / str(seed))
+            document = play(file, [f"{label}=run"], ["0"])
+        assert [cell["agent"] for cell in document["cells"]] == [*reversed(labels)]
 
 
 def test_calls_that_add_to_one_file_at_a_time_lose_nothing(said: Path, sadr: Path, tmp_path: Path, monkeypatch) -> None:
