@@ -24,6 +24,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import unwrap_wrapper
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
+from torch.backends.cpu import get_cpu_capability
 
 from sb3_said import SAID, DelayedSAC, __version__
 from sb3_said.delays import DelayedObservationWrapper, DelayProcess, FixedDelay
@@ -269,7 +270,8 @@ def origin(run: LoadedRun) -> dict[str, Any]:
     return {
         "command": f"{program} {shlex.join(sys.argv[1:])}",
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} CPU cores",
+        # Sums round otherwise with other instructions, such as AVX2 or AVX512: the same training then ends elsewhere
+        "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} CPU cores, {get_cpu_capability()}",
         "device": str(getattr(run.model, "device", "cpu")),  # random actions have none
         "torch_threads": th.get_num_threads(),
         "versions": {"python": platform.python_version(), "sb3_said": __version__, **{p: version(p) for p in packages}},

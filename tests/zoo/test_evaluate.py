@@ -62,6 +62,8 @@ def test_evaluate_measures_the_planner_and_the_expert(
     assert (document["seed"], document["n_episodes"], document["trained_steps"]) == (7, 3, 100)
     assert [result["label"] for result in document["results"]] == ["planner", "expert"]
     assert document["origin"]["torch_threads"] == 1  # two would wait for each other on a busy machine
+    instructions = document["origin"]["machine"].split(", ")[-1]  # by which sums round
+    assert f"CPU capability usage: {instructions}\n" in th.__config__.show()
     for sizes in decided.values():  # in episodes together, and timed one by one
         assert 2 in sizes and set(sizes[-5:]) == {1}
     # The file holds what the library measures for the same agent and seeds.
