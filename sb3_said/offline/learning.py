@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_said.delays.receivers import Actuator, NewestPacket
 from sb3_said.delays.space import ages_of, has_attribute
 from sb3_said.offline.datasets import Dataset, load_dataset
-from sb3_said.planner.checks import check_intervals
+from sb3_said.planner.checks import check_intervals, whole
 from sb3_said.sac import DelayedSAC
 
 SelfOffline = TypeVar("SelfOffline", bound="OfflineAlgorithm")
@@ -82,7 +82,8 @@ class OfflineAlgorithm(DelayedSAC):
         :param tb_log_name: name of the run in TensorBoard, the class's by default
         :param reset_num_timesteps: count from 0
         :param progress_bar: show one
-        :raises ValueError: as ``load_dataset`` does, and without the wrapper that gives a delayed agent its ages
+        :raises ValueError: as ``load_dataset`` does, for no count, and without the wrapper that gives a delayed agent
+            its ages
         """
         check_intervals(log_interval=log_interval)
         if isinstance(self.observation_space, spaces.Dict) and self._draw_ages() is None:
@@ -119,6 +120,7 @@ class OfflineAlgorithm(DelayedSAC):
         progress_bar: bool,
     ) -> BaseCallback:
         """Do what SB3's ``_setup_learn`` does, but for the environment; return the callbacks, not yet started."""
+        gradient_steps = whole("gradient_steps", gradient_steps, least=0)
         if dataset is not None:
             self.take_dataset(dataset, progress_bar)
         self.start_time = time.time_ns()

@@ -76,6 +76,7 @@ def read_file(path: Path, progress_bar: bool) -> Log:
     except Exception as error:  # NumPy, zipfile and HDF5 raise many kinds
         raise ValueError(f"{path} cannot be read; it is damaged, or no {path.suffix} file: {error}") from error
     task, about = given.pop(TASK, None), given.pop(ABOUT, "")
+    task = task.item() if isinstance(task, np.ndarray) and task.size == 1 else task  # a list of one name
     task = task.decode(errors="replace") if isinstance(task, bytes) else task
     name = os.fspath(path)
     parts = [(name, _of_columns(name, given))]

@@ -23,7 +23,7 @@ from huggingface_sb3 import EnvironmentName
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from tqdm import tqdm
 
-from sb3_said.delays.space import EXECUTED, UNDELAYED, check_spaces, scale_action
+from sb3_said.delays.space import EXECUTED, UNDELAYED, center_and_half, check_spaces, scale_action, within_bounds
 from sb3_said.offline.datasets import Dataset
 from sb3_said.offline.scores import normalized_score, reference_returns
 from sb3_said.offline.writing import check_target, write_dataset
@@ -31,6 +31,9 @@ from sb3_said.zoo.arguments import add_delay, add_playing, check_positive, expla
 from sb3_said.zoo.manager import ALGOS
 from sb3_said.zoo.record import import_packages
 from sb3_said.zoo.runs import LoadedRun, answering, load_run, origin
+
+#: Keeps noise and random actions apart from what the task and its delays draw from the same seed.
+NOISE_STREAM = 2
 
 EPILOG = """\
 examples:
@@ -124,17 +127,18 @@ class NoisyAgent:
     def __init__(self, model: Any, space: gym.spaces.Box, noise: float, seed: int):
         self.model, self.space, self.noise = model, space, noise
         self.policy = getattr(model, "policy", None)  # by which a recurrent agent is known
-        self.rng = np.random.default_rng(seed)
+        self.rng = np.random.default_rng([seed, NOISE_STREAM])
 
     def predict(self, observation: Any, state: Any = None, **how: Any) -> tuple[np.ndarray, Any]:
-        low, high = self.space.low, self.space.high
+        center, half = center_and_half(self.space)
         if self.model is None:
             n = len(next(iter(observation.values())) if isinstance(observation, dict) else observation)
-            drawn = self.rng.uniform(size=(n, *low.shape)) * (high - low) + low
-            return drawn.astype(low.dtype), None
+            if np.issubdtype(self.space.dtype, np.integer):  # rounded, each bound would have half of its share
+                low, high = self.space.low, self.space.high
+                return self.rng.integers(low, high, (n, *low.shape), low.dtype, endpoint=True), None
+            return within_bounds(center + half * self.rng.uniform(-1.0, 1.0, (n, *center.shape)), self.space), None
         action, state = self.model.predict(observation, state=state, **how)
-        drawn = self.rng.normal(size=action.shape) * self.noise * (high - low) / 2
-        return np.clip(action + drawn, low, high).astype(low.dtype), state
+        return within_bounds(action + self.noise * half * self.rng.normal(size=action.shape), self.space), state
 
 
 class ShareIsFull(Exception):

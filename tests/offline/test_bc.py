@@ -264,6 +264,11 @@ def test_an_interval_of_the_log_is_a_count():
         make().learn_offline(demonstrations(2), 2, log_interval=0)
 
 
+def test_gradient_steps_are_a_count():
+    with pytest.raises(ValueError, match="gradient_steps must be a whole number, at least 0, got -3"):
+        make().learn_offline(demonstrations(2), -3)
+
+
 def test_it_is_saved_and_loaded(learned, tmp_path):
     learned.save(tmp_path / "bc.zip")
     loaded = BC.load(tmp_path / "bc.zip", device="cpu")

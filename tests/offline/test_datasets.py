@@ -243,13 +243,14 @@ def test_a_combined_minari_dataset_has_all_episodes(log, tmp_path, monkeypatch):
     same(load("both-v0"), load([first, second]))
 
 
+@pytest.mark.parametrize("name", ["Walker2d-v5", ["Walker2d-v5"]])
 @pytest.mark.parametrize("suffix", [".npz", ".hdf5"])
-def test_a_file_of_another_task_is_refused(suffix, log, tmp_path):
+def test_a_file_of_another_task_is_refused(suffix, name, log, tmp_path):
     """Walker2d and HalfCheetah have the same shapes."""
-    path = write(tmp_path / f"log{suffix}", log | ({"env": np.array("Walker2d-v5")} if suffix == ".npz" else {}))
+    path = write(tmp_path / f"log{suffix}", log | ({"env": np.array(name)} if suffix == ".npz" else {}))
     if suffix == ".hdf5":
         with h5py.File(path, "a") as file:
-            file.attrs["env"] = "Walker2d-v5"
+            file.attrs["env"] = name
     with pytest.raises(ValueError, match=rf"log{suffix} is of Walker2d-v5, and the task is HalfCheetah-v5; give"):
         load(path, env_id="HalfCheetah-v5")
     with pytest.warns(UserWarning, match="of Walker2d-v5, and the task is Walker2d-v4: versions may differ"):

@@ -19,6 +19,7 @@ from gymnasium.envs.registration import EnvSpec
 pytest.importorskip("rl_zoo3")
 
 from logged_task import LoggedTask
+from scipy.stats import chisquare
 from small_run import ENV, write_run
 from small_task import Drift
 from stable_baselines3 import SAC
@@ -149,6 +150,33 @@ def test_noise_has_the_size_asked_for_in_units_of_the_range() -> None:
     assert (np.abs(loud) <= space.high).all() and (np.abs(loud) == space.high).any()
     drawn = NoisyAgent(None, space, 0.0, 0).predict({"observation": np.zeros((5000, 1))})[0]
     np.testing.assert_allclose([drawn.min(0), drawn.max(0)], [space.low, space.high], rtol=0.01)
+
+
+@pytest.mark.parametrize(("low", "high", "dtype"), [(-3, 3, np.int64), (-100, 100, np.int8), (0, 255, np.uint8)])
+def test_whole_numbers_are_drawn_evenly_and_rounded(low: int, high: int, dtype: type) -> None:
+    space = gym.spaces.Box(low, high, (1,), dtype)
+    drawn = NoisyAgent(None, space, 0.0, 0).predict(np.zeros((100_000, 1)))[0]
+    values, counts = np.unique(drawn, return_counts=True)
+    assert drawn.dtype == dtype and [*values] == [*range(low, high + 1)]
+    assert chisquare(counts).pvalue > 1e-4
+
+    class Between:
+        def predict(self, observation: Any, state: Any = None, **_: Any) -> Any:
+            return np.float32([[2.6], [high + 0.9], [low - 0.9], [low + 0.9]]), state
+
+    assert [*NoisyAgent(Between(), space, 0.0, 0).predict(None)[0][:, 0]] == [3, high, low, low + 1]
+
+
+def test_random_actions_do_not_follow_what_the_task_draws_from_the_seed() -> None:
+    env = gym.make("Pendulum-v1")
+    start = np.arctan2(*env.reset(seed=5)[0][1::-1])
+    action = NoisyAgent(None, env.action_space, 0.0, 5).predict(np.zeros((1, 3)))[0].item()
+    assert abs(action / 2.0 - start / np.pi) > 0.01  # each uniform, and the same number of the same generator
+
+
+def test_bounds_may_be_farther_apart_than_their_type_holds() -> None:
+    space = gym.spaces.Box(np.float32([-3e38]), np.float32([3e38]))
+    assert np.isfinite(NoisyAgent(None, space, 0.0, 0).predict(np.zeros((100, 1)))[0]).all()
 
 
 def test_an_agent_of_sb3_goes_into_minari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
