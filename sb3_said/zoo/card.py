@@ -22,7 +22,7 @@ from sb3_said.zoo.cells import Cell, Results, average
 from sb3_said.zoo.over_delays import digest_of
 from sb3_said.zoo.presets import config_file, preset_overrides
 from sb3_said.zoo.record import Record, evaluated
-from sb3_said.zoo.runs import LoadedRun, control_period, load_run, longest_delay
+from sb3_said.zoo.runs import LoadedRun, changes, control_period, load_run, longest_delay
 
 EPILOG = """\
 examples:
@@ -89,8 +89,13 @@ def make_card(
     :param results: of ``over-delays``, with cells of this file
     :param latency_ms: median time of a decision
     :param n_trial_steps: environment steps that told how the planner decides, beyond those of the training
-    :raises ValueError: when the results hold nothing of this file
+    :raises ValueError: when the results hold nothing of this file, or are of another task than its training
     """
+    if run.changes != (trained := changes(record.env_kwargs, record.wrappers)):
+        raise ValueError(
+            f"{run.info['file']} was trained in a task that its run changes by {trained}, and outside the run's folder "
+            f"plays in one changed by {run.changes}. Give the file as it lies in that folder, to over-delays, too."
+        )
     file = Path(run.info["file"])
     digest = digest_of(run)
     cells = [cell for cell in results.cells if cell.sha256 == digest and cell.result is not None]

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, SupportsFloat
+from typing import Any, SupportsFloat, cast
 
 import gymnasium as gym
 import numpy as np
@@ -134,8 +134,8 @@ class NoisyAgent:
         if self.model is None:
             n = len(next(iter(observation.values())) if isinstance(observation, dict) else observation)
             if np.issubdtype(self.space.dtype, np.integer):  # rounded, each bound would have half of its share
-                low, high = self.space.low, self.space.high
-                return self.rng.integers(low, high, (n, *low.shape), low.dtype, endpoint=True), None
+                low, high, dtype = cast(Any, (self.space.low, self.space.high, self.space.dtype))
+                return self.rng.integers(low, high, (n, *low.shape), dtype, endpoint=True), None
             return within_bounds(center + half * self.rng.uniform(-1.0, 1.0, (n, *center.shape)), self.space), None
         action, state = self.model.predict(observation, state=state, **how)
         return within_bounds(action + self.noise * half * self.rng.normal(size=action.shape), self.space), state

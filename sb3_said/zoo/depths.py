@@ -18,6 +18,7 @@ from sb3_said.planner.checks import check_same
 from sb3_said.said import SAID
 from sb3_said.said.training import planner_checkpoint
 from sb3_said.zoo.folder import log_suffix
+from sb3_said.zoo.stopping import Stopping
 
 
 class DepthPlanners:
@@ -137,11 +138,13 @@ class DepthPlanners:
         print(f"Training the planner of depth {depth}: {self.gradient_steps} updates", flush=True)
         policy = self.model.policy
         values, policy.values = policy.values, None  # all depths share that of the run
+        stopping = Stopping()
         try:
-            self.model.train_planner(self.gradient_steps, folder, self.progress_bar)
+            with stopping.listening():
+                self.model.train_planner(self.gradient_steps, folder, self.progress_bar, should_stop=stopping)
         finally:
             policy.values = values
         self.model.logger.close()
         if int(self.model.policy.planner_updates) < self.gradient_steps:
-            raise KeyboardInterrupt  # what was learned is kept, but half a planner serves no comparison
+            raise KeyboardInterrupt  # half a planner serves no comparison
         planner_checkpoint(folder, self.config.mask).unlink(missing_ok=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -64,14 +65,15 @@ def search(
     :param round_size: episodes between two looks at pruning
     :param seed: reset seed of the first episode
     :param timeout: seconds after which no trial is begun
+    :raises ValueError: where the agent earned what is not finite
     """
 
     def objective(trial: Trial) -> float:
-        params = suggest(trial, tried, sampler)
-        known = next((made for made in finished(study) if decisive(made.params) == decisive(params)), None)
-        if known is not None:  # of a smaller grid, in an earlier call, or of another choice where there is none
-            return repeat(trial, known)
         try:
+            params = suggest(trial, tried, sampler)
+            known = next((made for made in finished(study) if decisive(made.params) == decisive(params)), None)
+            if known is not None:  # of a smaller grid, in an earlier call, or of another choice where there is none
+                return repeat(trial, known)
             put(**params)
             return play_trial(trial, play, episodes, round_size, seed)
         except optuna.TrialPruned:
@@ -136,6 +138,8 @@ def play_trial(
     is_pruned = False
     while len(returns) < episodes and not is_pruned:
         for value in play(seed + len(returns), min(round_size, episodes - len(returns))):
+            if not math.isfinite(value):
+                raise ValueError(f"A reward is not finite: with {describe(trial.params)} an episode returned {value}.")
             trial.report(float(value), len(returns))
             returns.append(float(value))
         is_pruned = len(returns) < episodes and trial.should_prune()
@@ -181,14 +185,25 @@ def open_study(
 def _open_storage(storage: str) -> BaseStorage:
     if "://" not in storage:
         Path(storage).parent.mkdir(parents=True, exist_ok=True)
-        # The default lock is a symbolic link, which Windows lets few users make
-        return JournalStorage(JournalFileBackend(storage, JournalFileOpenLock(storage)))
+        lock = JournalFileOpenLock(storage)  # the default one is a symbolic link, which Windows lets few users make
+        lock.acquire()
+        try:
+            _cut_unfinished_line(Path(storage))
+        finally:
+            lock.release()
+        return JournalStorage(JournalFileBackend(storage, lock))
     # SQLite lets one worker write at a time, and tells the others that wait longer than this to give up.
     patience = {"connect_args": {"timeout": 120}} if storage.startswith("sqlite") else {}
     try:
         return RDBStorage(storage, engine_kwargs=patience)
     except SQLAlchemyError as error:
         raise ValueError(f"--storage {storage} cannot be opened: {str(error).splitlines()[0]}") from error
+
+
+def _cut_unfinished_line(journal: Path) -> None:
+    """Remove what a full disk or a power cut has left of a last line, which the next one would be joined to."""
+    if journal.exists() and not (written := journal.read_bytes()).endswith(b"\n"):
+        os.truncate(journal, written.rfind(b"\n") + 1)
 
 
 def finished(study: optuna.Study) -> list[FrozenTrial]:
@@ -198,7 +213,8 @@ def finished(study: optuna.Study) -> list[FrozenTrial]:
 
 
 def find_winner(study: optuna.Study) -> FrozenTrial | None:
-    """Return the complete trial of the highest mean; of equals, the shallowest, quickest and coldest."""
+    """Return the complete trial of the highest mean; of equals, the one of the lowest settings, in the order
+    of their names."""
     complete = [trial for trial in finished(study) if trial.state == TrialState.COMPLETE]
     return max(complete, key=lambda t: (t.value, *(-t.params[name] for name in sorted(t.params))), default=None)
 

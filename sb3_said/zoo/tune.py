@@ -26,7 +26,7 @@ from sb3_said.zoo.best import write_best
 from sb3_said.zoo.depths import DepthPlanners
 from sb3_said.zoo.evaluate import evaluate, print_table
 from sb3_said.zoo.folder import TUNED_NAME, TUNED_SETTINGS
-from sb3_said.zoo.record import Record
+from sb3_said.zoo.record import RECORD_NAME, Record
 from sb3_said.zoo.runs import LoadedRun, answers, load_run, origin
 from sb3_said.zoo.search import (
     DRAWN,
@@ -137,6 +137,10 @@ def tune(args: argparse.Namespace) -> None:
     began = time.monotonic()
     run, model = open_run(args)
     folder = args.output or args.run / "tune"
+    if (folder / RECORD_NAME).is_file() and not (folder / TUNED_SETTINGS).is_file():
+        raise ValueError(
+            f"{folder} is the folder of a run, whose {RECORD_NAME} would be replaced: give another --output."
+        )
     read_report(folder / RESULTS_NAME)  # what is no report is told now, and not after the trials
     dataset = Record.read(args.run).dataset
     planners = DepthPlanners(model, args.run / CHECKPOINT_NAME, folder, args.gradient_steps, args.progress, dataset)
@@ -165,10 +169,10 @@ def tune(args: argparse.Namespace) -> None:
     left = args.timeout - (time.monotonic() - began)
     how = (args.sampler, args.n_trials, args.episodes, args.round, args.seed, left)
     search(study, tried, planners.put, play, *how)
-    winner = find_winner(study)
-    if winner is None:
-        raise ValueError("No trial is finished, so there is no winner: give more --timeout or --n-trials.")
     with FileLock(folder / "report.lock"):
+        winner = find_winner(study)  # while nobody else reports one
+        if winner is None:
+            raise ValueError("No trial is finished, so there is no winner: give more --timeout or --n-trials.")
         planners.put(**winner.params)
         report(args, run, study, winner, folder)
 

@@ -4,6 +4,7 @@ import argparse
 import hashlib
 import json
 import shlex
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -147,6 +148,16 @@ def test_the_card_says_what_plays_an_agent_of_a_task_of_ones_own(run: Path) -> N
     played.changes["env_kwargs"] = {"g": 1.0}
     text = card.describe(played, record, results, [], None, 0)
     assert "| task changed by |" in text and "'g': 1.0" in text.replace('"', "'") and "shows it" not in text
+
+
+def test_returns_of_another_task_than_its_training_are_refused(run: Path, tmp_path: Path) -> None:
+    """A file alone does not know what its run changes."""
+    shutil.copy(run / f"{ENV}.zip", tmp_path / "alone.zip")
+    record = replace(Record.read(run), env_kwargs={"reset_noise_scale": 0.1})
+    with pytest.raises(
+        ValueError, match=r"alone\.zip was trained in a task that its run changes by .*reset_noise_scale"
+    ):
+        card.make_card(load_run(tmp_path / "alone.zip", device="cpu"), record, cast(Any, None))
 
 
 def test_the_card_says_how_candidates_decide(run: Path) -> None:

@@ -1,6 +1,7 @@
 """Planners of several depths: each trained once, resumed where it died, and put into an agent whose expert stays."""
 
 import functools
+import signal
 import threading
 import time
 from dataclasses import fields
@@ -15,6 +16,7 @@ from filelock import FileLock
 
 from sb3_said import SAID, PlannerConfig
 from sb3_said.files.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback
+from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.zoo.depths import DepthPlanners
 
 STEPS = 3
@@ -121,6 +123,30 @@ def test_a_killed_training_goes_on_bit_for_bit(run, tmp_path, monkeypatch):
     # The expert is the run's, whatever the planner.
     expert = SAID.load(run / "agent.zip", device="cpu").policy.actor.state_dict()
     th.testing.assert_close(again.model.policy.actor.state_dict(), expert, rtol=0, atol=0)
+
+
+def test_ctrl_c_keeps_every_update(run, tmp_path, monkeypatch):
+    step, made = PlannerTrainer.step, []
+
+    def counted(trainer, *how):
+        result = step(trainer, *how)
+        made.append(trainer.n_updates)
+        if made == [1, 2]:
+            signal.raise_signal(signal.SIGINT)
+        return result
+
+    monkeypatch.setattr(PlannerTrainer, "step", counted)
+    with pytest.raises(KeyboardInterrupt):
+        make(run, tmp_path, 5).train([2])
+    n_made = len(made)  # the update that was begun is ended
+    again = make(run, tmp_path, 5)
+    again.train([2])
+    assert n_made < 5 and len(made) == 5
+    again.put(2)
+    whole = make(run, tmp_path / "whole", 5)
+    whole.train([2])
+    whole.put(2)
+    same_planner(whole, again)
 
 
 def test_planners_of_another_training_are_refused(run, tmp_path):

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ pytest.importorskip("scipy")
 from optuna import Study
 from optuna.trial import TrialState
 
+from sb3_said.zoo import search as search_module
 from sb3_said.zoo.search import find_winner, finished, open_study, returns_of, save_plot, search
 
 
@@ -112,6 +114,30 @@ def test_a_cell_that_was_not_finished_is_tried_again(error: type[BaseException],
     agent = Agent(lambda temperature, **_: temperature)
     study = run(tmp_path, agent, [0.0, 0.5, 1.0])
     assert agent.n_put == 2 and cells(study) == [(0.0, 5), (0.5, 5), (1.0, 5)]
+
+
+def test_a_cell_that_was_being_chosen_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    agent = Agent(lambda temperature, **_: temperature)
+    run(tmp_path, agent, [0.0])
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(search_module, "decisive", Mock(side_effect=KeyboardInterrupt))
+        run(tmp_path, agent, [0.5])
+    assert cells(run(tmp_path, agent, [0.5])) == [(0.0, 5), (0.5, 5)]
+
+
+def test_what_is_not_finite_ends_the_search_and_is_tried_again(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"A reward is not finite: with depth 2, temperature 0\.5, .* returned nan"):
+        run(tmp_path, Agent(lambda temperature, **_: float("nan") if temperature else 1.0), [0.0, 0.5])
+    assert cells(run(tmp_path, Agent(lambda **_: 2.0), [0.0, 0.5])) == [(0.0, 5), (0.5, 5)]
+
+
+def test_a_journal_whose_last_line_was_cut_goes_on(tmp_path: Path) -> None:
+    agent = Agent(lambda temperature, **_: temperature)
+    run(tmp_path, agent, [0.0, 0.5])
+    journal = tmp_path / "study.log"
+    journal.write_bytes(journal.read_bytes()[:-7])
+    for temperatures in ([0.0, 0.5], [0.0, 0.5, 1.0]):
+        assert cells(run(tmp_path, agent, temperatures)) == [(temperature, 5) for temperature in temperatures]
 
 
 @pytest.mark.parametrize("sampler", ["grid", "tpe"])

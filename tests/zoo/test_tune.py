@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from sb3_said.files.checkpoint import CHECKPOINT_NAME
 from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.zoo import train, tune
 from sb3_said.zoo.arguments import read_delay
-from sb3_said.zoo.best import plain_settings
+from sb3_said.zoo.best import plain_settings, write_best
 from sb3_said.zoo.record import Record
 from sb3_said.zoo.runs import LoadedRun, load_run
 
@@ -208,6 +209,27 @@ def test_two_workers_share_a_study_and_train_no_depth_twice(run: Path, capsys: p
     check_report(run)
 
 
+def test_a_worker_that_waits_reports_the_winner_of_then(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    command, lock, play = [str(run), "--depths", "2", "--temperatures", "0", "1", *QUICK], tune.FileLock, LoadedRun.play
+
+    def better(self: LoadedRun, n: int, seed: int, *how: Any, **more: Any) -> Any:
+        played = play(self, n, seed, *how, **more)
+        played.returns[:] += 1000.0
+        return played
+
+    def waits(path: Path) -> Any:
+        monkeypatch.setattr(tune, "FileLock", lock)
+        with monkeypatch.context() as patched:
+            patched.setattr(LoadedRun, "play", better)
+            tune.main(command)
+        return lock(path)
+
+    monkeypatch.setattr(tune, "FileLock", waits)
+    tune.main([*command, "--n-trials", "1"])
+    results = results_of(run)
+    assert results["winner"]["mean_return"] == max(trial["mean_return"] for trial in results["trials"]) > 1000.0
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -256,6 +278,20 @@ def test_folders_that_cannot_be_tuned(run: Path, tmp_path: Path, capsys: pytest.
     with pytest.raises(SystemExit):
         tune.main([str(run), "--device", "cpu"])
     assert "has no checkpoint.zip" in capsys.readouterr().err
+
+
+def test_the_folder_of_a_run_is_no_output(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = (run / "run.json").read_bytes()
+    with pytest.raises(SystemExit):
+        tune.main([str(run), "--depths", "1", "--temperatures", "0", "--output", str(run), *QUICK])
+    assert "is the folder of a run, whose run.json would be replaced" in capsys.readouterr().err
+    assert (run / "run.json").read_bytes() == before
+
+
+def test_the_command_that_trains_with_it_begins_with_the_same_agent(run: Path, tmp_path: Path) -> None:
+    replace(Record.read(run), options={"trained_agent": "old.zip"}).write(run)
+    command = write_best(run, tmp_path, {}, 5, "chosen")
+    assert " -i old.zip " in command and f"# {command}\n" in (tmp_path / "best.yml").read_text()
 
 
 def test_what_yaml_cannot_hold_is_named() -> None:
