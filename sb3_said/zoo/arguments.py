@@ -127,7 +127,7 @@ def read_delay(words: list[str]) -> Delay:
     """
     if not words:
         return None
-    numbers = [int(word) for word in words if word.removeprefix("-").isdigit()]
+    numbers = [int(word) for word in words if word.removeprefix("-").isdecimal()]
     if len(words) > 1 and (len(words), len(numbers)) != (2, 2):
         raise ValueError(f"--delay takes N, or LOW HIGH, or one process in quotes, got {' '.join(words)}.")
     delay: int | list[int] | str = numbers if len(words) == 2 else numbers[0] if numbers else words[0]

@@ -258,7 +258,8 @@ def control_period(run: LoadedRun) -> float | None:
     """Return the control step of a simulated robot, in seconds; None where the task does not tell it."""
     env = run.make_env()
     try:
-        return getattr(env.unwrapped, "dt", None)
+        dt = getattr(env.unwrapped, "dt", None)
+        return float(dt) if isinstance(dt, (int, float, np.number)) and 0 < dt < np.inf else None  # not a method
     finally:
         env.close()
 

@@ -29,6 +29,7 @@ def test_what_delay_takes(words: list[str], delay: Delay) -> None:
         (["UniformDelay(0,", "8)"], "--delay takes N, or LOW HIGH"),
         (["4", "WIFI_20MS"], "--delay takes N, or LOW HIGH"),
         (["print(1)"], "expected numbers, WIFI_20MS, FixedDelay"),
+        (["²"], "is no delay: .* Write it as in docs"),
     ],
 )
 def test_a_bad_delay_is_refused(words: list[str], message: str) -> None:

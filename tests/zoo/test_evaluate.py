@@ -10,6 +10,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import gymnasium as gym
 import numpy as np
@@ -119,6 +120,8 @@ def test_the_period_is_the_tasks_own_where_it_tells(
     loaded = load_run(run, device="cpu")
     assert control_period(loaded) == gym.make(ENV).unwrapped.dt  # type: ignore[attr-defined]
     assert control_period(replace(loaded, make_env=lambda: gym.make("MountainCarContinuous-v0"))) is None
+    for dt in (lambda: 0.1, 0.0):
+        assert control_period(replace(loaded, make_env=lambda dt=dt: Mock(unwrapped=Mock(dt=dt)))) is None
     monkeypatch.setattr(evaluate, "control_period", lambda run: None)
     with pytest.raises(SystemExit):
         evaluate.main([str(run), "--realtime", "--episodes", "1", "--device", "cpu"])
