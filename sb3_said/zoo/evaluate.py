@@ -81,9 +81,11 @@ def opened(args: argparse.Namespace) -> tuple[dict[str, LoadedRun], Path, float]
     if args.plot is not None:
         plots.check_file(args.plot)  # what cannot be drawn is told now, and not after the episodes
         check_writable(args.plot)
-    delay = 0 if args.realtime and not args.delay else read_delay(args.delay)
-    how_played = args.algo, args.env, delay, args.device, None, args.gym_packages
+    how_played = args.algo, args.env, read_delay(args.delay), args.device, None, args.gym_packages
     run = load_run(args.run, *how_played)
+    if args.realtime and not args.delay and run.own_delay is None:  # what answers take is all the delay there is
+        how_played = args.algo, args.env, 0, args.device, None, args.gym_packages
+        run = load_run(args.run, *how_played)
     best = run.folder / BEST_NAME
     runs = {"best" if Path(run.info["file"]) == best else "last": run}
     if "last" in runs and Path(args.run).is_dir() and best.is_file():

@@ -113,6 +113,8 @@ def test_a_task_registered_with_its_delay_keeps_it(tmp_path: Path) -> None:
         cells = json.loads((tmp_path / "over.json").read_text())["cells"]
         assert [cell["result"] is None for cell in cells] == [False, True]
         assert cells[1]["obstacle"] == "its task is registered with a delay of its own, 1"
+        evaluate.main([str(run), "--realtime", "--period", "9", "--episodes", "1", "--latency-calls", "0"])
+        assert json.loads((run / "realtime.json").read_text())["delay"] == 1
     finally:
         del gym.registry["Late-v0"]
 
