@@ -69,6 +69,7 @@ class Video:
         """Take a frame, if one is due.
 
         :raises CannotDraw: without a working graphics library
+        :raises ValueError: where the task draws no frame
         """
         rate = env.metadata.get("render_fps") or self.fps  # control steps a second
         self.fps = min(self.fps, rate)
@@ -82,6 +83,10 @@ class Video:
             frame: Any = env.render()
         except Exception as error:
             raise CannotDraw(error) from error
+        if np.ndim(frame) != 3:
+            raise ValueError(
+                f"render() of the task returned {type(frame).__name__}, expected a frame, (height, width, 3) of uint8."
+            )
         self.append(frame)
 
     def append(self, frame: np.ndarray) -> None:

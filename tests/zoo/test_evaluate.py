@@ -350,6 +350,11 @@ def test_video_plays_in_real_time(fps: int, expected: int, own: int | None, tmp_
     assert imageio.immeta(video.path)["duration"] == pytest.approx(1000 / video.fps, abs=10)  # GIFs count in 10 ms
 
 
+def test_a_task_that_draws_nothing_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"render\(\) of the task returned NoneType, expected a frame"):
+        enjoy.Video(tmp_path / "film.gif", 10).on_step(Mock(metadata={}, render=lambda: None))
+
+
 def test_a_task_that_cannot_be_drawn_names_the_libraries(tmp_path: Path) -> None:
     class Broken:
         metadata: dict = {}
