@@ -125,7 +125,15 @@ def test_a_killed_training_goes_on_bit_for_bit(run, tmp_path, monkeypatch):
     th.testing.assert_close(again.model.policy.actor.state_dict(), expert, rtol=0, atol=0)
 
 
-def test_ctrl_c_keeps_every_update(run, tmp_path, monkeypatch):
+@pytest.fixture
+def heard_ctrl_c():
+    """A shell lets what it runs in the background ignore it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_ctrl_c_keeps_every_update(run, tmp_path, monkeypatch, heard_ctrl_c):
     step, made = PlannerTrainer.step, []
 
     def counted(trainer, *how):
