@@ -40,11 +40,9 @@ def write_best(run: Path, folder: Path, planner: dict[str, Any], n_updates: int,
     if (statistics := normalization_file(run / record.agent_name)).exists():
         shutil.copyfile(statistics, normalization_file(folder / record.agent_name))  # of all agents there
 
-    words = ["sb3-said", "train", "--algo", "said", *record.task_words()]
+    words = ["sb3-said", "train", "--algo", "said", *record.task_words(), *record.agent_words()]
     if record.eval_env_kwargs != record.env_kwargs:  # which the YAML has
         words += ["--eval-env-kwargs", *(f"{name}:{value!r}" for name, value in record.eval_env_kwargs.items())]
-    if trained := record.options.get("trained_agent"):
-        words += ["-i", trained]
     command = shlex.join([*words, "-conf", str(folder / TUNED_SETTINGS)])
 
     block, left_out = plain_settings(record)

@@ -250,9 +250,7 @@ def made_by(record: Record, model: Any = None) -> str:
     had = {name: getattr(model, name) for name in sorted(newer) if hasattr(model, name)} | record.hyperparams
     own = {name: value for name, value in had.items() if value != usual.get(name) and name != "n_timesteps"}
     words = ["sb3-said", "train", "--algo", record.algo, *record.task_words(), "--preset", record.preset, *budget]
-    if trained := record.options.get("trained_agent"):
-        words += ["-i", trained]
-    words += ["--seed", str(record.seed)]
+    words += [*record.agent_words(), "--seed", str(record.seed)]
     left_out = [*record.missing]
     for option, settings in (("-params", own), ("--env-kwargs", record.env_kwargs)):
         texts = {name: as_word(name, value) for name, value in settings.items()}

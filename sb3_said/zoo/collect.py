@@ -23,7 +23,15 @@ from huggingface_sb3 import EnvironmentName
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from tqdm import tqdm
 
-from sb3_said.delays.space import EXECUTED, UNDELAYED, center_and_half, check_spaces, scale_action, within_bounds
+from sb3_said.delays.space import (
+    EXECUTED,
+    UNDELAYED,
+    center_and_half,
+    check_spaces,
+    scale_action,
+    unscale_action,
+    within_bounds,
+)
 from sb3_said.offline.datasets import Dataset
 from sb3_said.offline.scores import normalized_score, reference_returns
 from sb3_said.offline.writing import check_target, write_dataset
@@ -130,13 +138,13 @@ class NoisyAgent:
         self.rng = np.random.default_rng([seed, NOISE_STREAM])
 
     def predict(self, observation: Any, state: Any = None, **how: Any) -> tuple[np.ndarray, Any]:
-        center, half = center_and_half(self.space)
         if self.model is None:
             n = len(next(iter(observation.values())) if isinstance(observation, dict) else observation)
             if np.issubdtype(self.space.dtype, np.integer):  # rounded, each bound would have half of its share
                 low, high, dtype = cast(Any, (self.space.low, self.space.high, self.space.dtype))
-                return self.rng.integers(low, high, (n, *low.shape), dtype, endpoint=True), None
-            return within_bounds(center + half * self.rng.uniform(-1.0, 1.0, (n, *center.shape)), self.space), None
+                return self.rng.integers(low, high, (n, *self.space.shape), dtype, endpoint=True), None
+            return unscale_action(self.rng.uniform(-1.0, 1.0, (n, *self.space.shape)), self.space), None
+        _, half = center_and_half(self.space)
         action, state = self.model.predict(observation, state=state, **how)
         return within_bounds(action + self.noise * half * self.rng.normal(size=action.shape), self.space), state
 

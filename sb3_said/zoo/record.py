@@ -81,6 +81,11 @@ class Record:
             words += [name, *values] if values else []
         return words
 
+    def agent_words(self) -> list[str]:
+        """Return the words of a command line that name the agent that the training began with, none for a new one."""
+        agent = self.options.get("trained_agent")
+        return ["-i", agent] if agent else []
+
     def write(self, folder: Path) -> None:
         """Write ``run.json`` into a folder; what it cannot hold is named in it."""
         hyperparams, missing = {}, dict(self.missing)

@@ -213,8 +213,7 @@ def finished(study: optuna.Study) -> list[FrozenTrial]:
 
 
 def find_winner(study: optuna.Study) -> FrozenTrial | None:
-    """Return the complete trial of the highest mean; of equals, the one of the lowest settings, in the order
-    of their names."""
+    """Return the complete trial of the highest mean; of equals, that of the lowest settings, by name."""
     complete = [trial for trial in finished(study) if trial.state == TrialState.COMPLETE]
     return max(complete, key=lambda t: (t.value, *(-t.params[name] for name in sorted(t.params))), default=None)
 
