@@ -70,7 +70,7 @@ def rollout(
     :param normalize: applied to batched observations before ``predict``, such as ``VecNormalize.normalize_obs``
     :param on_step: called with the environment after every step, for instance to render it
     :param on_episode: called with (episode, return, length) after every episode, in the order in which they end
-    :raises ValueError: when ``n_episodes`` or ``n_envs`` is not positive
+    :raises ValueError: when ``n_episodes`` or ``n_envs`` is not positive, or a return is not finite
     """
     if n_episodes < 1 or n_envs < 1:
         raise ValueError(f"n_episodes and n_envs must be at least 1, got n_episodes={n_episodes}, n_envs={n_envs}.")
@@ -115,6 +115,11 @@ def rollout(
                     on_step(e)
                 if terminated or truncated:
                     returns[episode] = _monitored(e, returns[episode])
+                    if not np.isfinite(returns[episode]):
+                        raise ValueError(
+                            f"Episode {episode} (seed {seed + episode}) returned {returns[episode]}: expected finite "
+                            "rewards; look at what the task rewards there."
+                        )
                     if on_episode is not None:
                         on_episode(episode, float(returns[episode]), int(lengths[episode]))
                     if next_episode == n_episodes:

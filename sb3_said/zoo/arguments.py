@@ -73,12 +73,13 @@ def reset_seed(word: str) -> int:
 
 
 def device(word: str) -> str:
-    """Return the name of a device that torch knows, or ``auto``."""
+    """Return the name of a device that torch has here, or ``auto``."""
     try:
         if word != "auto":
-            th.device(word)
-    except RuntimeError as error:
-        raise argparse.ArgumentTypeError(f"auto, cpu, cuda or another that torch has, got {word}: {error}") from error
+            th.zeros(1, device=word)
+    except (RuntimeError, AssertionError, ImportError) as error:  # as each backend says it
+        told = str(error).partition("\n")[0]
+        raise argparse.ArgumentTypeError(f"auto, cpu, cuda or another that torch has, got {word}: {told}") from error
     return word
 
 

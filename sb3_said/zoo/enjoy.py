@@ -115,7 +115,6 @@ class SideBySide(Video):
     def __init__(self, path: Path, fps: int):
         super().__init__(path, fps)
         self._plays: list[list[np.ndarray]] = []
-
         self._n_written = 0
 
     def begin(self) -> None:
@@ -139,7 +138,9 @@ class SideBySide(Video):
         self._plays = []
 
     def close(self) -> None:
-        self._write()
+        is_pair = len(self._plays) == 2 and all(self._plays)
+        if is_pair or not self._n_written:  # of a video of pairs, one that was interrupted alone has another size
+            self._write()
         self.frames = self._n_written
         super().close()
 

@@ -138,8 +138,6 @@ def play_trial(
     is_pruned = False
     while len(returns) < episodes and not is_pruned:
         for value in play(seed + len(returns), min(round_size, episodes - len(returns))):
-            if not math.isfinite(value):
-                raise ValueError(f"A reward is not finite: with {describe(trial.params)} an episode returned {value}.")
             trial.report(float(value), len(returns))
             returns.append(float(value))
         is_pruned = len(returns) < episodes and trial.should_prune()

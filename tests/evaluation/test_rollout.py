@@ -238,6 +238,25 @@ def test_rollout_refuses_counts_below_one(n_episodes: int, n_envs: int) -> None:
         rollout(Model(), Countdown, n_episodes, SEED, n_envs)
 
 
+@pytest.mark.parametrize("lost", [float("nan"), float("inf")])
+def test_a_return_that_is_not_finite_is_refused_where_it_was_played(lost: float) -> None:
+    lengths = rollout(Model(), Countdown, 4, SEED, 2).lengths
+    shortest = int(np.argmin(lengths))
+
+    class Lost(Countdown):
+        def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict]:
+            observation, info = super().reset(**kwargs)
+            self.is_lost = self.left == lengths[shortest]
+            return observation, info
+
+        def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+            observation, reward, *ended = super().step(action)
+            return observation, lost if self.is_lost else reward, *ended
+
+    with pytest.raises(ValueError, match=rf"Episode {shortest} \(seed {SEED + shortest}\) returned {lost}"):
+        rollout(Model(), Lost, 4, SEED, 2)
+
+
 def test_recurrent_states_of_sb3_contrib_are_cut_along_their_second_axis() -> None:
     class Lstm(Model):
         class policy:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import argparse
+
 import pytest
 
-from sb3_said.zoo.arguments import Delay, is_always, largest_delay, read_delay
+from sb3_said.zoo.arguments import Delay, device, is_always, largest_delay, read_delay
 
 
 @pytest.mark.parametrize(
@@ -42,3 +44,15 @@ def test_a_bad_delay_is_refused(words: list[str], message: str) -> None:
 )
 def test_a_delay_has_a_largest_age_and_may_vary(delay: Delay, largest: int, always: bool) -> None:
     assert (largest_delay(delay), is_always(delay, largest)) == (largest, always)
+
+
+def test_a_device_that_torch_has_not_here_is_refused_at_once() -> None:
+    assert [device(word) for word in ("auto", "cpu", "cpu:0")] == ["auto", "cpu", "cpu:0"]
+    refused = []
+    for word in ("mps", "xpu", "hpu"):  # of three makers: no machine has all
+        try:
+            device(word)
+        except argparse.ArgumentTypeError as error:
+            assert str(error).startswith(f"auto, cpu, cuda or another that torch has, got {word}: ")
+            refused.append(word)
+    assert refused

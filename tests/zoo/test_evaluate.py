@@ -422,6 +422,18 @@ def test_an_agent_beside_itself_that_ignores_the_delay(
         enjoy.main([str(run), "--beside-ignorant"])
 
 
+def test_a_pair_that_was_interrupted_leaves_those_before_it(tmp_path: Path) -> None:
+    imageio = pytest.importorskip("imageio.v3")
+    for n_plays, shape in ((3, (16, 32, 3)), (4, (16, 32, 3)), (1, (16, 16, 3))):  # the last one has no frame yet
+        video = enjoy.SideBySide(tmp_path / f"{n_plays}.gif", fps=10)
+        for play in range(n_plays):
+            video.begin()
+            for brightness in () if play == 3 else (200, 100):
+                video.append(np.full((16, 16, 3), brightness, np.uint8))
+        video.close()
+        assert video.frames == 2 and imageio.imread(video.path).shape == (2, *shape)
+
+
 def test_enjoy_draws_an_mp4(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
                             capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
     imageio = pytest.importorskip("imageio")

@@ -125,12 +125,6 @@ def test_a_cell_that_was_being_chosen_is_tried_again(tmp_path: Path, monkeypatch
     assert cells(run(tmp_path, agent, [0.5])) == [(0.0, 5), (0.5, 5)]
 
 
-def test_what_is_not_finite_ends_the_search_and_is_tried_again(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"A reward is not finite: with depth 2, temperature 0\.5, .* returned nan"):
-        run(tmp_path, Agent(lambda temperature, **_: float("nan") if temperature else 1.0), [0.0, 0.5])
-    assert cells(run(tmp_path, Agent(lambda **_: 2.0), [0.0, 0.5])) == [(0.0, 5), (0.5, 5)]
-
-
 def test_a_journal_whose_last_line_was_cut_goes_on(tmp_path: Path) -> None:
     agent = Agent(lambda temperature, **_: temperature)
     run(tmp_path, agent, [0.0, 0.5])
