@@ -94,8 +94,12 @@ def within_bounds(action: np.ndarray, action_space: spaces.Box) -> np.ndarray:
 
     :param action: (..., act_dim), in the units of the action space
     """
-    action = np.rint(action) if np.issubdtype(action_space.dtype, np.integer) else action
+    action = np.rint(action) if holds_whole_numbers(action_space) else action
     return np.clip(action, action_space.low, action_space.high).astype(action_space.dtype)
+
+
+def holds_whole_numbers(space: spaces.Box) -> bool:
+    return np.issubdtype(space.dtype, np.integer)
 
 
 def center_and_half(space: spaces.Box) -> tuple[np.ndarray, np.ndarray]:

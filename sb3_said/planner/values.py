@@ -27,7 +27,7 @@ def returns_to_go(
     :param value_fn: (states (K, obs_dim), actions (K, act_dim)) -> (K,), the value of the last stored step of an
         episode that was cut off. Without it an episode is taken to go on at its average reward
     :return: (M,) float32
-    :raises ValueError: for gamma = 1 without ``value_fn``, where going on for ever is worth no finite value
+    :raises ValueError: for gamma = 1 without ``value_fn`` where an episode was cut off, and so has no finite value
     """
     rewards = source.rewards[source.rows, source.envs].clone()  # (M,)
     terminated, last = source.terminated[source.rows, source.envs], source.remaining == 1
@@ -40,8 +40,11 @@ def returns_to_go(
         _, episode = source.episodes.unique(return_inverse=True)
         means = rewards.new_zeros(int(episode.max()) + 1).index_add(0, episode, rewards) / episode.bincount()
         rewards[cut] = means[episode[cut]] / (1.0 - gamma)
-    else:
-        raise ValueError(f"An episode that goes on has a finite value only with gamma < 1, got gamma={gamma}.")
+    elif cut.any():
+        raise ValueError(
+            f"An episode that goes on has a finite value only with gamma < 1, got gamma={gamma}: give a smaller one, or "
+            "train an expert first, whose critics tell what it is worth."
+        )
 
     order = (source.episodes * (int(source.remaining.max()) + 1) + source.remaining).argsort()  # newest step first
     value, values = 0.0, []

@@ -33,6 +33,7 @@ from sb3_said.delays.space import (
     check_one_max_delay,
     check_spaces,
     has_attribute,
+    holds_whole_numbers,
     written_ages,
 )
 from sb3_said.delays.wrapper import DelayedObservationWrapper
@@ -194,7 +195,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
         # The replay was emptied, or not loaded with the agent, or somebody has played the environments
         if obs is not None and not (self.replay_buffer.knows_past(obs).all() and self._are_at(obs)):
             self._last_obs = None  # SB3 then resets the environments
-        if self._last_obs is None and self.env is not None:
+        if (reset_num_timesteps or self._last_obs is None) and self.env is not None:
             for monitor in self._strict_monitors():
                 monitor.needs_reset = True
         self._note_task()
@@ -244,7 +245,10 @@ class DelayedSAC(SafeSaveMixin, SAC):
             self._last_episode_starts = np.ones((self.env.num_envs,), dtype=bool)
             if self._vec_normalize_env is not None:
                 self._last_original_obs = self._vec_normalize_env.get_original_obs()
-        return super()._sample_action(*args, **kwargs)
+        action, scaled = super()._sample_action(*args, **kwargs)
+        assert isinstance(self.action_space, spaces.Box)  # as check_spaces says
+        is_whole = holds_whole_numbers(self.action_space)  # then what is stored is what the task was sent
+        return action, self.policy.scale_action(action) if is_whole else scaled
 
     def _store_transition(self, *args: Any, **kwargs: Any) -> None:
         if self._last_obs is not None:  # else a callback has played at this very step, whose observation is gone

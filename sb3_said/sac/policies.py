@@ -20,7 +20,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 
-from sb3_said.delays.space import UNDELAYED, check_spaces
+from sb3_said.delays.space import UNDELAYED, check_spaces, holds_whole_numbers, scale_action, unscale_action
 from sb3_said.files.agents import SafePolicyMixin
 from sb3_said.files.arguments import instead_of
 from sb3_said.sac.episodes import TrainingEpisodes
@@ -223,6 +223,17 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         space = self.action_space
         assert isinstance(space, spaces.Box)  # as check_spaces says
         return np.clip(actions, space.low, space.high)  # scaling to the bounds may round to beyond them
+
+    def scale_action(self, action: np.ndarray) -> np.ndarray:
+        space = self.action_space
+        assert isinstance(space, spaces.Box)  # as check_spaces says
+        return scale_action(action, space) if holds_whole_numbers(space) else super().scale_action(action)
+
+    def unscale_action(self, scaled_action: np.ndarray) -> np.ndarray:
+        space = self.action_space
+        assert isinstance(space, spaces.Box)
+        is_whole = holds_whole_numbers(space)  # which SB3 leaves as fractions, in a type that may not hold the range
+        return unscale_action(scaled_action, space) if is_whole else super().unscale_action(scaled_action)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         actor = self.averaged_actor if self._answers_as_average else self.actor

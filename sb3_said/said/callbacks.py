@@ -57,7 +57,8 @@ class PlannerTrainingCallback(BaseCallback):
     def _on_rollout_start(self) -> None:
         # Here, and not in on_step, the replay buffer holds every step taken.
         freq, now = self.model.planner_train_freq, self.model.num_timesteps
-        if freq is not None and now // freq > self.model._planner_trained_at // freq:
+        is_due = freq is not None and now // freq > self.model._planner_trained_at // freq
+        if is_due and self.model.has_expert:  # before it has learned, a planner would imitate random actions
             self.model.train_planner(**self.how, trial_episodes=0)  # collection goes on, by the expert
 
     def _on_training_end(self) -> None:

@@ -46,7 +46,8 @@ class SAID(PlannerLearner, StableSAC):
     :param learning_rate: of the expert
     :param planner_kwargs: fields of :class:`~sb3_said.planner.PlannerConfig`; the attribute has all of them
     :param planner_gradient_steps: updates of one planner training; the paper makes 1,000,000
-    :param planner_train_freq: also train the planner every so many environment steps; the paper only at the end (None)
+    :param planner_train_freq: also train the planner every so many environment steps, once the expert learns; the paper
+        only at the end (None)
     :param planner_newest_fraction: train on the newest part of the buffer only. The paper takes all of it (Algorithm 1)
         and finds the newest 20 % as good; here they are better, where policies change fast
     :param planner_terminal_penalty: replaces the reward of a terminating step in the values that weigh windows. The

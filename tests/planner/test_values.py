@@ -77,6 +77,8 @@ def test_no_discount_needs_a_value_function():
     with pytest.raises(ValueError, match="gamma < 1"):
         returns_to_go(source, 1.0)
     assert sorted(returns_to_go(source, 1.0, value_fn=lambda s, a: th.full((len(s),), 7.0)).tolist()) == [7.0, 8.0]
+    ended = make_source([([1.0, 1.0], True), ([5.0], True)])
+    assert sorted(returns_to_go(ended, 1.0).tolist()) == [1.0, 2.0, 5.0]
 
 
 def test_the_range_is_from_the_lowest_to_the_highest():

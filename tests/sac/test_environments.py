@@ -12,6 +12,7 @@ from small_agent import make as make_agent
 from small_task import Drift, LateDelay, LateSimulator, OwnDelay, Simulator, delayed
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
@@ -23,7 +24,7 @@ from stable_baselines3.common.vec_env import (
 from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
-from sb3_said.delays import TotalDelay, UniformDelay
+from sb3_said.delays import TotalDelay, UniformDelay, scale_action
 
 make = partial(make_agent, cls=DelayedSAC)
 
@@ -39,6 +40,38 @@ def test_environments_in_processes_of_their_own(make_env, ages):
         assert make(vec).learn(20).trained_ages == ages
     finally:
         vec.close()
+
+
+class Steps(Drift):
+    """Counts what it is sent, as a motor that knows whole steps alone."""
+
+    def __init__(self, space):
+        super().__init__()
+        self.action_space, self.sent = space, []
+
+    def step(self, action):
+        self.sent.append(np.array(action))
+        return super().step(np.asarray(action, float))
+
+
+@pytest.mark.parametrize(("cls", "n_noise"), [(DelayedSAC, 0), (DelayedSAC, 1), (SAID, 0)])
+@pytest.mark.parametrize(
+    "space", [spaces.Box(-3, 5, (2,), np.int64), spaces.Box(-128, 127, (2,), np.int8), spaces.Box(0, 200, (2,), np.uint8)]
+)
+def test_whole_numbers_are_sent_stored_and_answered_as_they_are(cls, n_noise, space):
+    task = Steps(space)
+    noise = NormalActionNoise(np.zeros(2), np.full(2, 0.3)) if n_noise else None
+    model = make_agent(DelayedObservationWrapper(task, 2), cls, action_noise=noise, learning_starts=20).learn(45)
+    assert all(space.contains(action) for action in task.sent) and len(np.unique(task.sent)) > 3
+    stored = model.replay_buffer._get_samples(np.arange(45)).actions
+    np.testing.assert_allclose(stored, scale_action(np.array(task.sent), space), atol=1e-6)
+    histories = model.replay_buffer._get_samples(np.arange(45)).observations["action_history"]
+    np.testing.assert_allclose(histories[1:12, -1], stored[:11], atol=1e-6)  # of the first episode
+    obs = {key: np.repeat(part[None], 3, axis=0) for key, part in model.observation_space.sample().items()}
+    obs["delay"] = np.array([[0], [1], [2]])
+    for deterministic in (True, False):
+        answers = model.predict(obs, deterministic=deterministic)[0]
+        assert answers.dtype == space.dtype and all(space.contains(answer) for answer in answers)
 
 
 @pytest.mark.parametrize("task", [Drift, LateSimulator])

@@ -194,6 +194,7 @@ def test_learning_goes_on_under_monitors_that_refuse_resets(make_env):
     env = make_vec_env(make_env, 2, monitor_kwargs={"allow_early_resets": False})
     model = make(env).learn(100, callback=Stop(at=26))
     assert model.learn(20, reset_num_timesteps=False).num_timesteps == 46
+    assert model.learn(17).num_timesteps == 18  # counted anew, from a reset
     with pytest.raises(RuntimeError, match="reset"):
         env.reset()
 

@@ -120,6 +120,12 @@ def test_when_the_planner_is_trained(trainings, planner_train_freq, expected):
     assert model.policy.planner_updates == 6
 
 
+@pytest.mark.parametrize("gamma", [0.9, 1.0])
+def test_before_the_expert_has_learned_no_planner_imitates_random_actions(trainings, gamma):
+    make(planner_train_freq=10, gamma=gamma).learn(45)  # learning_starts is 20
+    assert begun(trainings) == [21, 30, 40, 45]
+
+
 def test_learning_on_and_counting_anew(trainings):
     model = make(planner_train_freq=40, buffer_size=200).learn(70)
     assert begun(trainings) == [40, 70]

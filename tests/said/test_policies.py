@@ -522,6 +522,16 @@ def test_no_actor_that_has_not_learned_decides():
         make().set_planner(decided_by="actor")
 
 
+def test_where_no_expert_has_learned_its_actor_does_not_decide(tmp_path):
+    model = make(learning_starts=100, planner_kwargs={"decided_by": "actor"})
+    with pytest.warns(UserWarning, match="No expert has learned whose actor could decide"):
+        model.learn(40)
+    model.save(tmp_path / "agent.zip")
+    loaded, obs = SAID.load(tmp_path / "agent.zip", device="cpu"), observe()
+    assert loaded.policy.planner.config.decided_by == "plan"
+    np.testing.assert_array_equal(answer(loaded, obs), answer(model, obs))
+
+
 def test_both_need_an_age_and_keep_what_each_has_met(saved, tmp_path):
     model = SAID.load(saved, device="cpu")
     max_delay = model.policy.max_delay
