@@ -42,8 +42,8 @@ def returns_to_go(
         rewards[cut] = means[episode[cut]] / (1.0 - gamma)
     elif cut.any():
         raise ValueError(
-            f"An episode that goes on has a finite value only with gamma < 1, got gamma={gamma}: give a smaller one, or "
-            "train an expert first, whose critics tell what it is worth."
+            f"An episode that goes on has a finite value only with gamma < 1, got gamma={gamma}: give a smaller "
+            "one, or train an expert first, whose critics tell what it is worth."
         )
 
     order = (source.episodes * (int(source.remaining.max()) + 1) + source.remaining).argsort()  # newest step first

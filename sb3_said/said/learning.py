@@ -123,7 +123,8 @@ class PlannerLearner(OfflineAlgorithm):
                 stacklevel=2,
             )
         if not self.has_expert and self.policy.planner.config.decided_by == "actor":
-            warnings.warn("No expert has learned whose actor could decide: the planner decides by its plan.", stacklevel=2)
+            told = "No expert has learned whose actor could decide: the planner decides by its plan."
+            warnings.warn(told, stacklevel=2)
             self.policy.planner.config = replace(self.policy.planner.config, decided_by="plan")
         if not hasattr(self, "_logger"):  # not set_logger: learn() makes its own
             self._logger = configure_logger(self.verbose, self.tensorboard_log, "SAID", reset_num_timesteps=False)

@@ -56,7 +56,8 @@ class Steps(Drift):
 
 @pytest.mark.parametrize(("cls", "n_noise"), [(DelayedSAC, 0), (DelayedSAC, 1), (SAID, 0)])
 @pytest.mark.parametrize(
-    "space", [spaces.Box(-3, 5, (2,), np.int64), spaces.Box(-128, 127, (2,), np.int8), spaces.Box(0, 200, (2,), np.uint8)]
+    "space",
+    [spaces.Box(-3, 5, (2,), np.int64), spaces.Box(-128, 127, (2,), np.int8), spaces.Box(0, 200, (2,), np.uint8)],
 )
 def test_whole_numbers_are_sent_stored_and_answered_as_they_are(cls, n_noise, space):
     task = Steps(space)
