@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -44,10 +46,8 @@ def evaluate_answer(model: SAID, like: EvalCallback, folder: Path, stopping: Sto
     path, now, who = folder / "evaluations.npz", model.num_timesteps, model.policy.who_answers
     rows: dict[int, Sequence[Any]] = {0: ([np.nan] * len(returns), [0] * len(returns), "")}
     if path.exists():
-        with np.load(path) as file:
-            old = [file[name].tolist() for name in ("timesteps", "results", "ep_lengths", "answers")]
         # An evaluation of as many episodes alone can stand in one array with this.
-        rows |= {t: row for t, *row in zip(*old, strict=True) if 0 < t < now and len(row[0]) == len(returns)}
+        rows |= {t: row for t, *row in _rows_before(path) if 0 < t < now and len(row[0]) == len(returns)}
     best = max((np.mean(row[0]) for step, row in rows.items() if step > 0), default=-np.inf)
     rows[now] = (returns, lengths, who)
     with replacing(path) as file:
@@ -61,6 +61,17 @@ def evaluate_answer(model: SAID, like: EvalCallback, folder: Path, stopping: Sto
     model.logger.dump(model.num_timesteps)
     if mean >= best:
         save_with_normalization(model, folder / BEST_NAME)
+
+
+def _rows_before(path: Path) -> list[tuple[Any, ...]]:
+    """Return the rows of a file of evaluations, and none, with a warning, of one that is damaged: step, returns, ..."""
+    try:
+        with np.load(path) as file:
+            columns = [file[name].tolist() for name in ("timesteps", "results", "ep_lengths", "answers")]
+        return [*zip(*columns, strict=True)]
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        warnings.warn(f"{path} cannot be read ({error}), and is begun anew.", stacklevel=3)
+        return []
 
 
 def save_with_normalization(model: DelayedSAC, path: Path) -> None:

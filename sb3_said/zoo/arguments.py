@@ -121,6 +121,21 @@ def ending_training(*errors: type[Exception]) -> Iterator[None]:
         sys.exit(f"sb3-said train: error: {error}")
 
 
+#: What code in a setting may raise, beside ``ValueError`` and ``TypeError``.
+OF_CODE = (ArithmeticError, AttributeError, LookupError, NameError, RuntimeError, SyntaxError)
+
+
+@contextmanager
+def reading_settings() -> Iterator[None]:
+    """
+    :raises ValueError: for a setting whose code fails, or names what there is not
+    """
+    try:
+        yield
+    except OF_CODE as error:
+        raise ValueError(f"A setting cannot be read: {error!r}") from error
+
+
 def read_delay(words: list[str]) -> Delay:
     """Return the words of ``--delay`` in the form that YAML and the wrapper take.
 

@@ -266,7 +266,8 @@ def _print_rows(
     for row in rows:
         print("| " + " | ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)) + " |")
     units = dict.fromkeys(over for row in averages.values() for _, over in row if over)
-    print(f"95 % intervals over {', or '.join(units)}")
+    if units:
+        print(f"95 % intervals over {', or '.join(units)}")
 
 
 def average(

@@ -12,7 +12,7 @@ from sb3_said.files.archive import SavedFileError, load_metadata
 from sb3_said.files.atomic import remove_abandoned
 from sb3_said.files.normalization import normalization_file, normalizes_observations
 from sb3_said.zoo.answer import BEST_NAME, EXPERT_FOLDER
-from sb3_said.zoo.record import RECORD_NAME, Record
+from sb3_said.zoo.record import GIVEN_NAME, RECORD_NAME, Record
 
 TUNED_NAME, TUNED_SETTINGS = "best.zip", "best.yml"  # what sb3-said tune leaves in its folder
 
@@ -100,16 +100,20 @@ def find_normalization(file: Path, record: Record | None) -> Path | None:
     """Return where an agent's statistics of ``VecNormalize`` are, None without.
 
     Statistics of observations beside an agent that was taught on observations as they are belonged to another one of
-    its name: they are left out, with a warning.
+    its name: they are left out, with a warning. So it is where they are the last agent's, of another step.
 
     :param file: of the agent; this and the next as :func:`find_agent` returns them
     :raises SavedFileError: where the statistics cannot be read
     """
-    agents = [file]
-    if record is not None:  # rl_zoo3's checkpoints (--save-freq) have none of their own
-        agents.append(file.with_name(record.agent_name))
-    found = next((path for path in map(normalization_file, agents) if path.is_file()), None)
+    own = normalization_file(file)
+    agents = [own]
+    if record is not None and file.name != GIVEN_NAME:  # rl_zoo3's checkpoints (--save-freq) have none of their own
+        agents.append(normalization_file(file.with_name(record.agent_name)))
+    found = next((path for path in agents if path.is_file()), None)
     if found is None or not (_reads_them_as_they_are(file) and normalizes_observations(found)):
+        if found not in (None, own):
+            told = f"{file} is played with {found}, statistics of VecNormalize of another step: it has none of its own."
+            warnings.warn(told, stacklevel=2)
         return found
     warnings.warn(
         f"{found} is left out: {file} learned of observations as they are, so it belonged to another agent of that "

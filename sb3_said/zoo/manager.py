@@ -34,7 +34,7 @@ from sb3_said.offline import BC, DQL, OfflineAlgorithm
 from sb3_said.offline.datasets import is_file
 from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.zoo.answer import BEST_NAME, EXPERT_FOLDER, evaluate_answer, save_with_normalization
-from sb3_said.zoo.arguments import Delay, ending_training, largest_delay
+from sb3_said.zoo.arguments import Delay, ending_training, largest_delay, reading_settings
 from sb3_said.zoo.folder import (
     claim_folder,
     drop_undone_episodes,
@@ -138,6 +138,8 @@ class DelayedExperimentManager(ExperimentManager):
         self._uuid = zoo_kwargs.get("uuid_str", "")
         self._given = given = self.custom_hyperparams or {}
         if run.resume is not None and run.record is not None:
+            if self.optimize_hyperparameters:
+                raise ValueError("-optimize searches anew, and goes on with no run: leave --resume out.")
             if (evaluates := run.record.options.get("eval_freq", 1) > 0) != (self.eval_freq > 0):
                 raise ValueError(
                     f"--resume goes on as the run began, {'with' if evaluates else 'without'} evaluations: --eval-freq "
@@ -183,9 +185,10 @@ class DelayedExperimentManager(ExperimentManager):
             for settings in (hyperparams, saved):
                 for name in set(settings) - set(self.custom_hyperparams or {}):
                     del settings[name]
-        for name in EVALUATED:
-            if isinstance(text := saved.get(name), str):
-                saved[name], hyperparams[name] = (eval(text, vars(exp_manager)) for _ in range(2))
+        with reading_settings():
+            for name in EVALUATED:
+                if isinstance(text := saved.get(name), str):
+                    saved[name], hyperparams[name] = (eval(text, vars(exp_manager)) for _ in range(2))
         self._own_wrappers = saved.pop("env_wrapper", None)
         wrappers = with_delay(self._own_wrappers, self.run.delay, self.run.expert_delay)
         if wrappers:
@@ -205,7 +208,13 @@ class DelayedExperimentManager(ExperimentManager):
                 "gymnasium.wrappers.NormalizeObservation and NormalizeReward keep statistics that no file holds, and "
                 "each evaluation has others: take -params \"normalize:dict(norm_obs_keys=['observation'])\"."
             )
-        made = super()._preprocess_hyperparams(hyperparams)
+        if "ParallelTrainCallback" in str(hyperparams.get("callback")):
+            raise ValueError(
+                "rl_zoo3's ParallelTrainCallback trains a copy of the agent, whose file it reads with pickle, and ours "
+                "have none: leave it out."
+            )
+        with reading_settings():
+            made = super()._preprocess_hyperparams(hyperparams)
         if self.n_envs < 1:
             raise ValueError(f"n_envs must be at least 1, got {self.n_envs}.")
         before = self.n_envs if self.run.record is None else self.run.record.hyperparams.get("n_envs", 1)
@@ -214,6 +223,10 @@ class DelayedExperimentManager(ExperimentManager):
         if self._eval_env_kwargs_args is None and self.run.record is None:
             self.eval_env_kwargs = self.env_kwargs
         return made
+
+    def _preprocess_action_noise(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        with reading_settings():
+            return super()._preprocess_action_noise(*args, **kwargs)
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         """Make the agent as rl_zoo3 does. Settings that do not fit end the program, and leave no new folder behind.
@@ -355,6 +368,8 @@ class DelayedExperimentManager(ExperimentManager):
                     # Where a trial has chosen among ways, what the run began with is none of them
                     asked = self._given if model.planner_ways else self.custom_hyperparams or {}
                     _decide_as_given(model, asked.get("planner_kwargs", {}))
+            with ending_training(ValueError):
+                self._check_more_steps(model.num_timesteps)
             print(f"Resuming {self.save_path} at step {model.num_timesteps}")
             drop_undone_episodes(self.checkpoint)
         if self.run.record is not None:
@@ -389,6 +404,20 @@ class DelayedExperimentManager(ExperimentManager):
             with suppress(EOFError, ConnectionError):  # of processes that have ended already
                 if model.env is not None:
                     model.env.close()
+
+    def _check_more_steps(self, taken: int) -> None:
+        """
+        :raises ValueError: for a -n of fewer steps than the run has taken, which no record should say it has
+        """
+        record = self.run.record
+        assert record is not None  # a checkpoint is of a run that is resumed
+        asked = record.options.get("n_timesteps", -1)
+        asked = asked if asked > 0 else record.hyperparams.get("n_timesteps", taken)
+        if self.n_timesteps < min(taken, asked):
+            raise ValueError(
+                f"{self.save_path} has taken {taken} steps: give -n more than that, or leave it out, got "
+                f"{self.n_timesteps}."
+            )
 
     def _learn(self, model: Any, steps: int, **how: Any) -> None:
         """Learn for so many steps, and evaluate the planner where there is one."""
@@ -432,7 +461,7 @@ class DelayedExperimentManager(ExperimentManager):
         if self.verbose > 0:
             formats.append(make_output_format("stdout", self.save_path))
         if self.tensorboard_log is not None:
-            board = Path(self.tensorboard_log, self.algo, self.folder.name)
+            board = Path(self.tensorboard_log, self.algo, self.folder.resolve().name)
             formats.append(make_output_format("tensorboard", str(board)))
         return Logger(self.save_path, formats)
 

@@ -13,6 +13,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -102,7 +103,9 @@ def main(argv: list[str] | None = None) -> None:
     changed = {rows[cell.agent] for cell in shown if cell.is_changed and cell.agent in rows}
     print_scores({row: x for row, x in table.items() if row not in changed}, columns, settings["env"])
     print_manners(shown, rows)
-    if args.plot is not None and any(table.values()):
+    if args.plot is not None and not any(table.values()):
+        print(f"Nothing was played that {args.plot} could show.")
+    elif args.plot is not None:
         title = f"{settings['env']} under delay: means of {settings['n_episodes']} episodes, 95 % intervals"
         told_right = {row: {c: x for c, x in of_row.items() if AGE not in str(c)} for row, of_row in table.items()}
         plots.save(plots.plot_over_delays(told_right, title)[0], args.plot)
@@ -335,6 +338,11 @@ def play_all(cells: list[Cell], env_id: str, args: argparse.Namespace) -> Iterat
     try:
         futures = {pool.submit(play, cell, *how): cell for cell in cells}
         yield from ((futures[future], future.result()) for future in as_completed(futures))
+    except BrokenProcessPool as error:
+        raise OSError(
+            "A worker was ended, perhaps for lack of memory: give fewer --workers. What was played is kept, and the "
+            "same command goes on."
+        ) from error
     finally:
         pool.shutdown(cancel_futures=True)
 

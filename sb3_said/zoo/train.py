@@ -14,7 +14,7 @@ import rl_zoo3.train
 
 from sb3_said.offline import OfflineAlgorithm
 from sb3_said.offline.datasets import is_file
-from sb3_said.zoo.arguments import Delay, add_delay, check_positive, device, explained, make_parser, read_delay
+from sb3_said.zoo.arguments import OF_CODE, Delay, add_delay, check_positive, device, explained, make_parser, read_delay
 from sb3_said.zoo.folder import TUNED_SETTINGS
 from sb3_said.zoo.manager import ALGORITHMS, ALGOS, DelayedExperimentManager, Run
 from sb3_said.zoo.offline import OfflineExperimentManager
@@ -123,7 +123,7 @@ def main(argv: list[str] | None = None) -> None:
     sys.argv = [sys.argv[0], "--algo", algo, *zoo_argv]
     try:
         rl_zoo3.train.train()
-    except (AssertionError, ImportError, NameError, SyntaxError, ValueError) as error:
+    except (AssertionError, ImportError, ValueError, *OF_CODE) as error:
         if made:
             raise
         parser.error(str(error))  # of the options that rl_zoo3 reads, some of which it evaluates

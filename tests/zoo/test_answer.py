@@ -102,6 +102,20 @@ def test_a_later_planner_is_added_and_the_best_is_kept(tmp_path: Path, monkeypat
     assert {step: np.mean(row) for step, row in rows.items() if step} == {100: 5.0, 200: 4.0, 300: 1.0}
 
 
+@pytest.mark.parametrize("damage", ["cut", "another file"])
+def test_evaluations_that_cannot_be_read_are_begun_anew(damage: str, tmp_path: Path) -> None:
+    """Else a resume would lose what it trained, each time."""
+    model, file = small_agent.make(), tmp_path / "evaluations.npz"
+    model.set_logger(Logger(None, []))
+    model.num_timesteps = 100
+    np.savez(file, timesteps=[50])
+    if damage == "cut":
+        file.write_bytes(file.read_bytes()[:-30])
+    with pytest.warns(UserWarning, match="cannot be read .* begun anew"):
+        evaluate_answer(model, EvalCallback(Monitor(delayed()), n_eval_episodes=2), tmp_path, Stopping())
+    assert list(returns_of(file)) == [0, 100] and (tmp_path / "best_model.zip").is_file()
+
+
 def test_the_episodes_are_the_same_whatever_was_evaluated_before(tmp_path: Path) -> None:
     """As a run that goes on after a stop has new environments."""
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from threading import Barrier
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,7 +14,8 @@ import pytest
 pytest.importorskip("rl_zoo3")
 
 from sb3_said.files.archive import save_tree
-from sb3_said.zoo.folder import claim_folder, drop_undone_episodes, hold_folder
+from sb3_said.files.normalization import normalization_file
+from sb3_said.zoo.folder import claim_folder, drop_undone_episodes, find_normalization, hold_folder
 
 
 def test_trainings_that_start_together_claim_folders_of_their_own(tmp_path: Path) -> None:
@@ -52,3 +55,23 @@ def test_a_forged_note_cuts_and_lengthens_nothing(noted: Any, tmp_path: Path) ->
     save_tree(run / "checkpoint.zip", {}, {"monitors": noted})
     drop_undone_episodes(run / "checkpoint.zip")
     assert [file.read_text() for file in files] == ["12345"] * 3
+
+
+def test_statistics_of_the_last_agent_serve_checkpoints_with_a_warning_and_not_what_the_run_began_with(
+    tmp_path: Path,
+) -> None:
+    record: Any = SimpleNamespace(agent_name="Task.zip")
+    agents = [tmp_path / name for name in ("Task.zip", "best_model.zip", "rl_model_50_steps.zip", "given.zip")]
+    last, best, checkpoint, given = agents
+    for agent in agents:
+        agent.touch()
+    own = normalization_file(last)
+    for statistics in (own, normalization_file(best)):
+        statistics.touch()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert find_normalization(last, record) == own
+        assert find_normalization(best, record) == normalization_file(best)
+        assert find_normalization(given, record) is None
+    with pytest.warns(UserWarning, match="rl_model_50_steps.zip is played with .*, statistics .* of another step"):
+        assert find_normalization(checkpoint, record) == own

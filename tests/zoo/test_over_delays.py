@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import warnings
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -331,6 +332,26 @@ def test_workers_change_the_speed_only(said: Path, tmp_path: Path) -> None:
     one, two = (play(tmp_path / f"{n}.json", [said], delays, "--workers", n) for n in ("1", "2"))
     assert one["cells"] == two["cells"]
     assert [cell["result"] is None for cell in two["cells"]] == [False, True] * 2
+
+
+def test_a_worker_that_is_killed_is_told_of(
+    said: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def killed(*_: Any, **__: Any) -> Any:
+        raise BrokenProcessPool("A process in the process pool was terminated abruptly")
+
+    monkeypatch.setattr(over_delays, "as_completed", killed)
+    with pytest.raises(SystemExit):
+        play(tmp_path / "out.json", [said], ["1"], "--workers", "2")
+    assert "fewer --workers. What was played is kept" in capsys.readouterr().err
+
+
+def test_a_table_without_a_number_has_no_interval_and_no_plot(
+    said: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    play(tmp_path / "out.json", [said], ["9"], "--plot", str(tmp_path / "plot.png"))
+    out = capsys.readouterr().out
+    assert "Nothing was played that" in out and "95 %" not in out and not (tmp_path / "plot.png").exists()
 
 
 def test_workers_end_with_a_killed_command() -> None:

@@ -426,6 +426,9 @@ def test_the_expert_can_learn_under_another_delay(tmp_path: Path, monkeypatch: p
         ("--n-timesteps -7", "got -7"),
         ("--device gpu", "auto, cpu, cuda or another that torch has, got gpu"),
         ("-params gamma:nine", "name 'nine' is not defined"),
+        ("-params gamma:1/0", "division by zero"),
+        ("-params policy_kwargs:dict(activation_fn=nn.ELUU)", "module 'torch.nn' has no attribute 'ELUU'"),
+        ("--env-kwargs g:[][0]", "list index out of range"),
         ("--n-eval-envs 0", "--n-eval-envs must be at least 1, got 0"),
         ("--eval-episodes 0", "--eval-episodes must be at least 1, got 0"),
         ("--num-threads 0", "--num-threads must be at least 1, got 0"),
@@ -460,6 +463,11 @@ def test_says_what_is_wrong(words: str, message: str, tmp_path: Path, capsys: py
         ("-params env_wrapper:'gymnasium.wrappers.NormalizeObservation'", "statistics that no file holds"),
         ("-params frame_stack:2", "frame_stack wraps all environments at once, and no command could play the agent"),
         ("-tb /dev/null/x", "/dev/null"),
+        ("-params env_wrapper:'gymnasium.wrappers.Nosuch'", "cannot be read: AttributeError.*Nosuch"),
+        ("-params noise_type:'normal'", "cannot be read: KeyError.*noise_std"),
+        ("-params noise_type:'foo' noise_std:0.1", "cannot be read: RuntimeError.*foo"),
+        ("-params normalize:'foo('", "cannot be read: SyntaxError"),
+        ("-params callback:'rl_zoo3.callbacks.ParallelTrainCallback'", "trains a copy of the agent"),
     ],
 )
 def test_settings_that_do_not_fit_are_said_and_leave_no_folder(words: str, message: str, tmp_path: Path) -> None:
@@ -483,6 +491,15 @@ def test_a_search_of_rl_zoo3_leaves_no_folder_of_a_run(tmp_path: Path) -> None:
     search = "-optimize --n-trials 1 --n-startup-trials 0 --n-evaluations 1 --n-eval-envs 1 -params buffer_size:100"
     train_here(tmp_path, f"--algo sadr --env Pendulum-v1 --seed 1 -n 20 {search}")
     assert not [*tmp_path.rglob("*_1")]
+
+
+def test_a_resume_of_fewer_steps_than_there_are_is_refused(finished: Path) -> None:
+    record = (finished / "run.json").read_bytes()
+    with pytest.raises(SystemExit, match="has taken 200 steps: give -n more than that, or leave it out, got 150"):
+        train.main(["--resume", str(finished), "-n", "150"])
+    assert (finished / "run.json").read_bytes() == record and (finished / "ended.json").is_file()
+    with pytest.raises(SystemExit, match="2"):
+        train.main(["--resume", str(finished), "-optimize"])
 
 
 def test_a_resume_takes_no_option_of_the_start(
