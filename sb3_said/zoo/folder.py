@@ -111,7 +111,7 @@ def find_normalization(file: Path, record: Record | None) -> Path | None:
         agents.append(normalization_file(file.with_name(record.agent_name)))
     found = next((path for path in agents if path.is_file()), None)
     if found is None or not (_reads_them_as_they_are(file) and normalizes_observations(found)):
-        if found not in (None, own):
+        if found not in (None, own) and file.name.startswith("rl_model_"):
             told = f"{file} is played with {found}, statistics of VecNormalize of another step: it has none of its own."
             warnings.warn(told, stacklevel=2)
         return found
