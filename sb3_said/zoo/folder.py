@@ -100,7 +100,7 @@ def find_normalization(file: Path, record: Record | None) -> Path | None:
     """Return where an agent's statistics of ``VecNormalize`` are, None without.
 
     Statistics of observations beside an agent that was taught on observations as they are belonged to another one of
-    its name: they are left out, with a warning. rl_zoo3's checkpoints are played with the last agent's, with a warning, too.
+    its name: they are left out, with a warning. rl_zoo3's checkpoints are played with the last agent's, and a warning.
 
     :param file: of the agent; this and the next as :func:`find_agent` returns them
     :raises SavedFileError: where the statistics cannot be read
