@@ -60,7 +60,7 @@ def plain_settings(record: Record) -> tuple[dict[str, Any], list[str]]:
     """
     given = {name: value for name, value in record.hyperparams.items() if name != "env_wrapper" or value}
     given |= {"env_kwargs": record.env_kwargs} if record.env_kwargs else {}
-    given |= {"n_timesteps": n} if (n := record.options.get("n_timesteps", -1)) > 0 else {}
+    given |= {} if record.n_timesteps is None else {"n_timesteps": record.n_timesteps}
     block, left_out = {}, list(record.missing)
     for name, value in given.items():
         try:

@@ -28,6 +28,7 @@ from sb3_said.delays.space import (
     UNDELAYED,
     center_and_half,
     check_spaces,
+    holds_whole_numbers,
     scale_action,
     unscale_action,
     within_bounds,
@@ -140,7 +141,7 @@ class NoisyAgent:
     def predict(self, observation: Any, state: Any = None, **how: Any) -> tuple[np.ndarray, Any]:
         if self.model is None:
             n = len(next(iter(observation.values())) if isinstance(observation, dict) else observation)
-            if np.issubdtype(self.space.dtype, np.integer):  # rounded, each bound would have half of its share
+            if holds_whole_numbers(self.space):  # rounded, each bound would have half of its share
                 low, high, dtype = cast(Any, (self.space.low, self.space.high, self.space.dtype))
                 return self.rng.integers(low, high, (n, *self.space.shape), dtype, endpoint=True), None
             return unscale_action(self.rng.uniform(-1.0, 1.0, (n, *self.space.shape)), self.space), None

@@ -110,17 +110,17 @@ def find_normalization(file: Path, record: Record | None) -> Path | None:
     if record is not None and file.name != GIVEN_NAME:  # rl_zoo3's checkpoints (--save-freq) have none of their own
         agents.append(normalization_file(file.with_name(record.agent_name)))
     found = next((path for path in agents if path.is_file()), None)
-    if found is None or not (_reads_them_as_they_are(file) and normalizes_observations(found)):
-        if found not in (None, own) and file.name.startswith("rl_model_"):
-            told = f"{file} is played with {found}, statistics of VecNormalize of another step: it has none of its own."
-            warnings.warn(told, stacklevel=2)
-        return found
-    warnings.warn(
-        f"{found} is left out: {file} learned of observations as they are, so it belonged to another agent of that "
-        "name. Delete it.",
-        stacklevel=2,
-    )
-    return None
+    if found is not None and _reads_them_as_they_are(file) and normalizes_observations(found):
+        warnings.warn(
+            f"{found} is left out: {file} learned of observations as they are, so it belonged to another agent of that "
+            "name. Delete it.",
+            stacklevel=2,
+        )
+        return None
+    if found not in (None, own) and file.name.startswith("rl_model_"):
+        told = f"{file} is played with {found}, statistics of VecNormalize of another step: it has none of its own."
+        warnings.warn(told, stacklevel=2)
+    return found
 
 
 def _reads_them_as_they_are(agent: Path) -> bool:

@@ -363,13 +363,12 @@ class DelayedExperimentManager(ExperimentManager):
             with ending_training(SavedFileError):
                 callbacks = CallbackList(self.callbacks)
                 restore_training(model, self.checkpoint, callbacks)  # type: ignore[arg-type]  # one of ALGORITHMS
-            if isinstance(model, SAID) and model.policy.planner_is_trained:  # else it is made as was asked for
-                with ending_training(ValueError):
+            with ending_training(ValueError):
+                self._check_more_steps(model.num_timesteps)
+                if isinstance(model, SAID) and model.policy.planner_is_trained:  # else it is made as was asked for
                     # Where a trial has chosen among ways, what the run began with is none of them
                     asked = self._given if model.planner_ways else self.custom_hyperparams or {}
                     _decide_as_given(model, asked.get("planner_kwargs", {}))
-            with ending_training(ValueError):
-                self._check_more_steps(model.num_timesteps)
             print(f"Resuming {self.save_path} at step {model.num_timesteps}")
             drop_undone_episodes(self.checkpoint)
         if self.run.record is not None:
@@ -411,9 +410,7 @@ class DelayedExperimentManager(ExperimentManager):
         """
         record = self.run.record
         assert record is not None  # a checkpoint is of a run that is resumed
-        asked = record.options.get("n_timesteps", -1)
-        asked = asked if asked > 0 else record.hyperparams.get("n_timesteps", taken)
-        if self.n_timesteps < min(taken, asked):
+        if self.n_timesteps < min(taken, record.n_timesteps or taken):
             raise ValueError(
                 f"{self.save_path} has taken {taken} steps: give -n more than that, or leave it out, got "
                 f"{self.n_timesteps}."

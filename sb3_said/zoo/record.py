@@ -72,6 +72,12 @@ class Record:
         """Name of the trained agent's file, as rl_zoo3 gives it."""
         return f"{EnvironmentName(self.env)}.zip"
 
+    @property
+    def n_timesteps(self) -> int | None:
+        """The steps it was asked for on the command line, else by its hyper-parameters; None where neither says."""
+        given = self.options.get("n_timesteps") or -1  # rl_zoo3's, which leaves it to them
+        return given if given > 0 else self.hyperparams.get("n_timesteps")
+
     def task_words(self) -> list[str]:
         """Return the words of a command line that name the task: what is played, under which delays, or which logs."""
         words = ["--env", self.env]

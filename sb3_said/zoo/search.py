@@ -137,7 +137,13 @@ def play_trial(
     returns: list[float] = []
     is_pruned = False
     while len(returns) < episodes and not is_pruned:
-        for value in play(seed + len(returns), min(round_size, episodes - len(returns))):
+        try:
+            played = play(seed + len(returns), min(round_size, episodes - len(returns)))
+        except ValueError as error:  # Optuna is silent about the settings
+            raise ValueError(f"With {describe(trial.params)}: {error}") from error
+        for value in played:
+            if not math.isfinite(value):
+                raise ValueError(f"A reward is not finite: with {describe(trial.params)} an episode returned {value}.")
             trial.report(float(value), len(returns))
             returns.append(float(value))
         is_pruned = len(returns) < episodes and trial.should_prune()

@@ -54,20 +54,20 @@ class Steps(Drift):
         return super().step(np.asarray(action, float))
 
 
-@pytest.mark.parametrize(("cls", "n_noise"), [(DelayedSAC, 0), (DelayedSAC, 1), (SAID, 0)])
+@pytest.mark.parametrize(("cls", "is_noisy"), [(DelayedSAC, False), (DelayedSAC, True), (SAID, False)])
 @pytest.mark.parametrize(
     "space",
     [spaces.Box(-3, 5, (2,), np.int64), spaces.Box(-128, 127, (2,), np.int8), spaces.Box(0, 200, (2,), np.uint8)],
 )
-def test_whole_numbers_are_sent_stored_and_answered_as_they_are(cls, n_noise, space):
+def test_whole_numbers_are_sent_stored_and_answered_as_they_are(cls, is_noisy, space):
     task = Steps(space)
-    noise = NormalActionNoise(np.zeros(2), np.full(2, 0.3)) if n_noise else None
+    noise = NormalActionNoise(np.zeros(2), np.full(2, 0.3)) if is_noisy else None
     model = make_agent(DelayedObservationWrapper(task, 2), cls, action_noise=noise, learning_starts=20).learn(45)
     assert all(space.contains(action) for action in task.sent) and len(np.unique(task.sent)) > 3
-    stored = model.replay_buffer._get_samples(np.arange(45)).actions
-    np.testing.assert_allclose(stored, scale_action(np.array(task.sent), space), atol=1e-6)
-    histories = model.replay_buffer._get_samples(np.arange(45)).observations["action_history"]
-    np.testing.assert_allclose(histories[1:12, -1], stored[:11], atol=1e-6)  # of the first episode
+    stored = model.replay_buffer._get_samples(np.arange(45))
+    np.testing.assert_allclose(stored.actions, scale_action(np.array(task.sent), space), atol=1e-6)
+    newest = stored.observations["action_history"][:, -1]
+    np.testing.assert_allclose(newest[1:12], stored.actions[:11], atol=1e-6)  # of the first episode
     obs = {key: np.repeat(part[None], 3, axis=0) for key, part in model.observation_space.sample().items()}
     obs["delay"] = np.array([[0], [1], [2]])
     for deterministic in (True, False):

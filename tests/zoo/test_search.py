@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
+import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.wrappers import TransformReward
 
 pytest.importorskip("rl_zoo3")
 pytest.importorskip("scipy")
@@ -17,6 +19,7 @@ pytest.importorskip("scipy")
 from optuna import Study
 from optuna.trial import TrialState
 
+from sb3_said.evaluation import rollout
 from sb3_said.zoo import search as search_module
 from sb3_said.zoo.search import find_winner, finished, open_study, returns_of, save_plot, search
 
@@ -123,6 +126,21 @@ def test_a_cell_that_was_being_chosen_is_tried_again(tmp_path: Path, monkeypatch
         patched.setattr(search_module, "decisive", Mock(side_effect=KeyboardInterrupt))
         run(tmp_path, agent, [0.5])
     assert cells(run(tmp_path, agent, [0.5])) == [(0.0, 5), (0.5, 5)]
+
+
+def test_what_is_not_finite_ends_the_search_and_is_tried_again(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"A reward is not finite: with depth 2, temperature 0\.5, .* returned nan"):
+        run(tmp_path, Agent(lambda temperature, **_: float("nan") if temperature else 1.0), [0.0, 0.5])
+    assert cells(run(tmp_path, Agent(lambda **_: 2.0), [0.0, 0.5])) == [(0.0, 5), (0.5, 5)]
+
+
+def test_what_cannot_be_played_is_told_with_its_settings(tmp_path: Path) -> None:
+    model = Mock(predict=lambda obs, **_: (np.zeros((len(obs), 1)), None))
+    task = TransformReward(gym.make("Pendulum-v1", max_episode_steps=2), lambda _: float("nan"))
+    agent = Agent(lambda **_: rollout(model, lambda: task, 1, seed=7).returns[0])
+    told = r"^With depth 2, temperature 0\.5, .*: Episode 0 \(seed 7\) returned nan"
+    with pytest.raises(ValueError, match=told):
+        run(tmp_path, agent, [0.5])
 
 
 def test_a_journal_whose_last_line_was_cut_goes_on(tmp_path: Path) -> None:
