@@ -17,7 +17,7 @@ from sb3_said.files.checks import check_tensors
 from sb3_said.planner.checks import check_same
 from sb3_said.said import SAID
 from sb3_said.said.training import planner_checkpoint
-from sb3_said.zoo.folder import log_suffix
+from sb3_said.zoo.folder import log_suffix, resuming
 from sb3_said.zoo.stopping import Stopping
 
 
@@ -126,7 +126,7 @@ class DepthPlanners:
             if steps != self.model.num_timesteps:
                 raise ValueError(
                     f"the agent has seen {self.model.num_timesteps} steps, the replay is of step {steps}; finish the "
-                    f"run first: sb3-said train --resume {self.checkpoint.parent}"
+                    f"run first: sb3-said train {resuming(self.checkpoint.parent)}"
                 )
             buffer.load_state_dict(state["replay_buffer"])
 

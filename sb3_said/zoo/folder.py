@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import warnings
 from pathlib import Path
 
@@ -30,6 +31,11 @@ def claim_folder(parent: Path, name: str, suffix: str = "") -> Path:
             return folder
         except FileExistsError:
             continue
+
+
+def resuming(folder: Path) -> str:
+    """Return the option that goes on with a run, as a shell takes it."""
+    return f"--resume {shlex.quote(str(folder))}"
 
 
 def hold_folder(folder: Path) -> FileLock:
@@ -92,7 +98,7 @@ def find_agent(path: Path) -> tuple[Path, Record | None]:
         if (path / name).is_file():
             return path / name, record
     raise ValueError(
-        f"{path} has no finished agent: none of {', '.join(names)}. sb3-said train --resume {path} goes on with it."
+        f"{path} has no finished agent: none of {', '.join(names)}. sb3-said train {resuming(path)} goes on with it."
     )
 
 

@@ -42,6 +42,7 @@ from sb3_said.zoo.folder import (
     find_normalization,
     hold_folder,
     log_suffix,
+    resuming,
 )
 from sb3_said.zoo.presets import config_file, preset_overrides
 from sb3_said.zoo.record import ENDED_NAME, EVALUATED, GIVEN_NAME, Record, make_wrapper, options_of, with_delay
@@ -394,9 +395,9 @@ class DelayedExperimentManager(ExperimentManager):
             self.stopping.is_asked = True
             written = not self.stopping.is_forced and self._save_checkpoint(model)
             state = "and wrote a checkpoint" if written else "without a checkpoint of this step"
-            print(f"Interrupted at step {model.num_timesteps} {state}; go on with --resume {self.save_path}")
+            print(f"Interrupted at step {model.num_timesteps} {state}; go on with {resuming(self.folder)}")
         except Exception:
-            print(f"Stopped at step {model.num_timesteps} by an error; --resume {self.save_path} goes on from the "
+            print(f"Stopped at step {model.num_timesteps} by an error; {resuming(self.folder)} goes on from the "
                   "last checkpoint, or begins again where there is none.")  # fmt: skip
             raise
         finally:

@@ -36,7 +36,7 @@ from sb3_said.files.archive import SavedFileError, load_metadata
 from sb3_said.files.normalization import load_normalization, normalization_file
 from sb3_said.said.policies import Answer
 from sb3_said.zoo.arguments import Delay, largest_delay
-from sb3_said.zoo.folder import find_agent, find_normalization
+from sb3_said.zoo.folder import find_agent, find_normalization, resuming
 from sb3_said.zoo.manager import ALGORITHMS, has_its_planner
 from sb3_said.zoo.record import ENDED_NAME, WRAPPER, Record, import_packages, make_wrapper
 
@@ -188,8 +188,8 @@ def _warn_if_unfinished(model: BaseAlgorithm, file: Path, record: Record | None)
     has_some = model.policy.planner_is_trained
     what = "trained to the end, and tried: it plays as it is" if has_some else "trained: its expert plays"
     warnings.warn(
-        f"This run stopped after {model.num_timesteps} steps, before its planner was {what}. sb3-said train --resume "
-        f"{file.parent} goes on.",
+        f"This run stopped after {model.num_timesteps} steps, before its planner was {what}. sb3-said train "
+        f"{resuming(file.parent)} goes on.",
         stacklevel=3,
     )
 

@@ -177,12 +177,13 @@ def read_command_line(argv: list[str]) -> tuple[Run, str, list[str]]:
     return run, algo, joined_settings([f"--env={options.env or 'Pendulum-v1'}", f"--seed={seed}", *zoo_argv])
 
 
-def of_the_start(argv: list[str]) -> dict[str, str | None]:
+def of_the_start(argv: list[str]) -> dict[str, Any]:
     """Return those of rl_zoo3's options that have no effect once a run has begun, with what they were given."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     options = (("-conf", "--conf-file"), ("-f", "--log-folder"), ("-i", "--trained-agent"))
     for names in (*options, ("--storage",), ("--study-name",), ("--trial-id",)):
         parser.add_argument(*names, dest=names[-1])
+    parser.add_argument("-uuid", "--uuid", dest="--uuid", action="store_const", const=True)
     return vars(parser.parse_known_args(argv)[0])
 
 

@@ -302,9 +302,11 @@ def test_paths_that_hold_no_agent(run: Path, tmp_path: Path) -> None:
         load_run(run.parent)
     with pytest.raises(ValueError, match=r"holds no run: .*run.json is missing"):
         load_run(tmp_path)
-    Record("said", ENV).write(tmp_path)
-    with pytest.raises(ValueError, match=r"no finished agent.*train --resume .* goes on with it"):
-        load_run(tmp_path)
+    unfinished = tmp_path / "of two words"
+    unfinished.mkdir()
+    Record("said", ENV).write(unfinished)
+    with pytest.raises(ValueError, match=r"no finished agent.*train --resume '.*of two words' goes on with it"):
+        load_run(unfinished)
 
 
 @pytest.mark.parametrize(

@@ -505,7 +505,15 @@ def test_a_resume_of_fewer_steps_than_there_are_is_refused(finished: Path) -> No
 def test_a_resume_takes_no_option_of_the_start(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for words in ("-conf own.yml", "-f elsewhere", "--storage x.log", "--study-name s", "--trial-id 3", "-i a.zip"):
+    for words in (
+        "-conf own.yml",
+        "-f elsewhere",
+        "--storage x.log",
+        "--study-name s",
+        "--trial-id 3",
+        "-i a.zip",
+        "-uuid",
+    ):
         with pytest.raises(SystemExit):
             train.main(["--resume", str(finished), *words.split()])
         assert "goes on with the run's own --" in capsys.readouterr().err
