@@ -8,6 +8,7 @@ import torch as th
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sb3_said.planner import PlannerConfig
 from sb3_said.planner.values import VALUE_SCALES, returns_to_go, scaled_values, window_weight
 from sb3_said.replay.windows import WindowSource
 
@@ -118,6 +119,16 @@ def test_the_rank_is_the_part_of_the_others_below(values):
     above = (others > values).sum(1) + ((others == values).sum(1) - 1) / 2
     ranks = scaled_values(th.tensor(values, dtype=th.float32), "rank")
     np.testing.assert_allclose(ranks, above / max(1, len(values) - 1), rtol=1e-6)
+
+
+def test_by_default_falls_weigh_next_to_nothing_where_all_begin_low():
+    """By ranks a start that leads to a fall weighs half of one that does not: most windows are worth more than both."""
+    config = PlannerConfig()
+    falls, starts, later = th.linspace(-100, 0, 200), th.linspace(300, 400, 100), th.linspace(500, 800, 10_000)
+    values = th.cat([falls, starts, later])
+    weights = window_weight(scaled_values(values, config.value_scale), config.weight_factor)
+    assert weights[:200].max() < weights[200:300].min() / 10
+    assert weights[200:300].min() > weights.max() / 100  # and still count themselves
 
 
 def test_ranks_weigh_alike_whatever_the_scale_of_values():
