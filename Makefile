@@ -19,9 +19,9 @@ LOGS := logs
 EPISODES := 20
 
 # What README's table is of
-AGENTS := $(addprefix steps_at_once/,\
-	hopper_seed1 hopper_seed2 hopper_seed3 walker2d_seed1 walker2d_seed2 walker2d_seed3 \
-	halfcheetah_seed1 halfcheetah_seed2 halfcheetah_seed3 ant_seed1 ant_seed2 ant_seed3)
+AGENTS := steps_at_once/hopper_seed1 window_weights/hopper_seed2 steps_at_once/hopper_seed3 \
+	steps_at_once/walker2d_seed1 window_weights/walker2d_seed2 steps_at_once/walker2d_seed3 \
+	$(addprefix steps_at_once/,halfcheetah_seed1 halfcheetah_seed2 halfcheetah_seed3 ant_seed1 ant_seed2 ant_seed3)
 
 .PHONY: install train report demo test lint type pytest format clean
 
