@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 from huggingface_hub import EvalResult, ModelCard, ModelCardData
 
-from sb3_said import SAID
+from sb3_said import SAID, PlannerConfig
 from sb3_said.delays.space import written_ages
 from sb3_said.files.atomic import check_writable
 from sb3_said.files.normalization import normalization_file
@@ -236,7 +236,7 @@ def who_answers(model: Any) -> str:
 def made_by(record: Record, model: Any = None) -> str:
     """Return the command that trains such an agent, with the settings that are not the preset's.
 
-    :param model: the agent, which has the settings that the preset got since
+    :param model: the agent, which has the settings that the preset got since, and those of its planner
     """
     file = config_file(record.algo, bool(record.dataset))
     blocks = yaml.safe_load(file.read_text())
@@ -248,6 +248,11 @@ def made_by(record: Record, model: Any = None) -> str:
     budget = ["-n", str(steps)] if steps > 0 else []
     newer = usual.keys() - record.hyperparams.keys() - {"policy", "planner_kwargs"}
     had = {name: getattr(model, name) for name in sorted(newer) if hasattr(model, name)} | record.hyperparams
+    given = had.get("planner_kwargs") or {}
+    if isinstance(model, SAID) and isinstance(given, dict):
+        asked, has = PlannerConfig(**given).weight_settings(), model.policy.planner.config.weight_settings()
+        older = {name: value for name, value in has.items() if value != asked[name] and name != "mask"}  # of the trial
+        had |= {"planner_kwargs": given | older} if older else {}
     own = {name: value for name, value in had.items() if value != usual.get(name) and name != "n_timesteps"}
     words = ["sb3-said", "train", "--algo", record.algo, *record.task_words(), "--preset", record.preset, *budget]
     words += [*record.agent_words(), "--seed", str(record.seed)]

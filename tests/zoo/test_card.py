@@ -1,6 +1,7 @@
 """sb3-said card: what stands in it is what was measured of that very file."""
 
 import argparse
+import ast
 import hashlib
 import json
 import shlex
@@ -85,6 +86,19 @@ def test_the_command_makes_the_agent_again_whatever_the_preset_says_since() -> N
                     options={"trained_agent": "old.zip"}, env_kwargs={"forward_reward_weight": 2.0})  # fmt: skip
     command = card.made_by(record, SimpleNamespace(gamma=0.99, planner_kwargs={"depth": 2}))
     assert command.endswith("-i old.zip --seed 1 -params gamma:0.99 --env-kwargs forward_reward_weight:2.0")
+
+
+def test_the_command_has_what_the_planner_learned_with_before_its_defaults_changed(run: Path) -> None:
+    def settings_in(command: str) -> dict[str, Any]:
+        words = [word for word in shlex.split(command) if word.startswith("planner_kwargs:")]
+        return ast.literal_eval(words[0].removeprefix("planner_kwargs:")) if words else {}
+
+    played, record = load_run(run, device="cpu"), Record.read(run)
+    assert isinstance(played.model, SAID)
+    before, planner = settings_in(card.made_by(record, played.model)), played.model.policy.planner
+    planner.config = replace(planner.config, weight_factor=2.0, value_scale="rank", mask="own", present="inpainted")
+    since = settings_in(card.made_by(record, played.model))  # but for the mask and the present, which a trial chooses
+    assert since == before | {"weight_factor": 2.0, "value_scale": "rank"}
 
 
 def test_the_command_of_settings_with_classes_makes_them_again(tmp_path: Path) -> None:
