@@ -156,9 +156,19 @@ class SAID(PlannerLearner, StableSAC):
         super()._refuse_unknown(given, known)
 
     def _check_file(self, saved: dict[str, Any]) -> None:
-        """Refuse a trained planner of other settings than this agent's, of which its weights mean something else."""
+        """Refuse a trained planner of other settings than this agent's, of which its weights mean something else.
+
+        And a student where this agent has none, or one of another width.
+        """
         super()._check_file(saved)
-        if saved["parameters"]["policy"].get("planner_updates", 0) > 0:
+        policy = saved["parameters"]["policy"]
+        width, own = len(policy.get("student.network.0.bias", ())), self.student_width or 0
+        if width and width != own:
+            raise ValueError(
+                f"it has a student of width {width}, and this agent {f'one of {own}' if own else 'none'}. Make this "
+                f"agent with student_width={width}, or take load() in place of set_parameters()"
+            )
+        if policy.get("planner_updates", 0) > 0:
             settings = saved.get("settings") or saved["arguments"]  # of a checkpoint, or of save()
             self._check_weights(from_data(settings.get("planner_kwargs", {})), WEIGHT_SETTINGS)
 

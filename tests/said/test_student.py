@@ -15,6 +15,7 @@ from torch.nn import functional as F
 
 from sb3_said import SAID
 from sb3_said.delays.space import delayed_space
+from sb3_said.files.archive import SavedFileError
 from sb3_said.sac.extractors import StateAugmentedExtractor
 from sb3_said.said import student as student_module
 from sb3_said.said.student import Student
@@ -254,6 +255,19 @@ def test_without_delay_and_with_normalized_observations(normalized):
     if normalized:
         np.testing.assert_array_equal(env.obs_rms["observation"].mean, before)
         assert env.training
+
+
+@pytest.mark.parametrize(("width", "own"), [(None, "none"), (8, "one of 8")])
+def test_parameters_with_a_student_ask_for_one_of_its_width(width, own, taught, tmp_path):
+    taught.save(tmp_path / "taught.zip")
+    kwargs = {"planner_kwargs": taught.planner_kwargs}
+    with pytest.raises(SavedFileError, match=rf"width 32, and this agent {own}\. .* student_width=32"):
+        make(student_width=width, **kwargs).set_parameters(tmp_path / "taught.zip")
+    model = make(student_width=32, **kwargs)
+    model.set_parameters(tmp_path / "taught.zip")
+    obs = observe()
+    with model.policy.answering("student"), taught.policy.answering("student"):
+        assert np.array_equal(answer(model, obs), answer(taught, obs))
 
 
 @pytest.mark.parametrize(
