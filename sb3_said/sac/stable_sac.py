@@ -77,8 +77,9 @@ class StableSAC(DelayedSAC):
         critic_layer_norm: bool = False,
         **sac_kwargs: Any,
     ):
-        if policy_delay < 1:
-            raise ValueError(f"policy_delay must be at least 1, got {policy_delay}.")
+        for name, count in (("policy_delay", policy_delay), ("first_gamma_steps", first_gamma_steps)):
+            if count < 1 or count % 1 != 0:
+                raise ValueError(f"{name} must be a whole number, at least 1, got {count}.")
         if not 0.0 <= actor_averaging < 1.0:
             raise ValueError(f"actor_averaging is a decay in [0, 1), got {actor_averaging}.")
         if first_gamma is not None and not 0.0 <= first_gamma <= 1.0:

@@ -58,7 +58,8 @@ class PlannerTrainingCallback(BaseCallback):
         # Here, and not in on_step, the replay buffer holds every step taken.
         freq, now = self.model.planner_train_freq, self.model.num_timesteps
         is_due = freq is not None and now // freq > self.model._planner_trained_at // freq
-        if is_due and self.model.has_expert:  # before it has learned, a planner would imitate random actions
+        is_due &= self.model.replay_buffer.size() > 0  # which no agent has that was saved amid learn()
+        if is_due and self.model.has_expert and now > self.model.learning_starts:  # else it imitates random actions
             self.model.train_planner(**self.how, trial_episodes=0)  # collection goes on, by the expert
 
     def _on_training_end(self) -> None:

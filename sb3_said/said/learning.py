@@ -23,7 +23,7 @@ from sb3_said.planner.values import returns_to_go
 from sb3_said.said.policies import SAIDPolicy, Value
 from sb3_said.said.training import PlannerTraining
 from sb3_said.said.trial import MakeEnv, let_the_best_answer, stopped_alone
-from sb3_said.said.ways import in_way, masks_of, ways_of
+from sb3_said.said.ways import in_way, masks_of, untried, ways_of
 
 HELD_OUT = 0.05  # of the planner's data
 HAND_OVER_INTERVAL = 100  # updates of an offline training
@@ -119,10 +119,11 @@ class PlannerLearner(OfflineAlgorithm):
         n_episodes = self.planner_trial_episodes if trial_episodes is None else trial_episodes
         n_episodes = whole("trial_episodes", n_episodes, least=0)
         learned_online = not self.replay_buffer.holds_logs  # of logs num_timesteps counts updates
-        if learned_online and not self.has_expert and 0 < self.num_timesteps <= self.learning_starts:
+        if learned_online and 0 < self.num_timesteps <= self.learning_starts:
+            go_on = ", or with reset_num_timesteps=False" if self.has_expert else ""
             warnings.warn(
-                f"The expert has not learned yet: after {self.num_timesteps} steps, of which the first learning_starts="
-                f"{self.learning_starts} are random actions, the planner imitates those. Learn for longer.",
+                f"The planner imitates random actions, which the newest {self.num_timesteps} steps are: learn() begins "
+                f"with learning_starts={self.learning_starts} of them. Learn for longer{go_on}.",
                 stacklevel=2,
             )
         if not self.has_expert and self.policy.planner.config.decided_by == "actor":
@@ -187,7 +188,8 @@ class PlannerLearner(OfflineAlgorithm):
 
         No environment is stepped and no expert is trained; the planner serves every delay 0..D. Callbacks are called
         after each update, and meet a planner that is at most 100 updates old, after the last one as it is.
-        ``num_timesteps`` counts updates. From the first on the planner answers, by plans.
+        ``num_timesteps`` counts updates. From the first on the planner answers, by plans, and in the default way where
+        a trial had chosen another: none is played on logs.
 
         :param dataset: whatever :func:`~sb3_said.offline.load_dataset` reads; None for what ``take_dataset`` took
         :param gradient_steps: ``planner_gradient_steps`` by default
@@ -210,8 +212,12 @@ class PlannerLearner(OfflineAlgorithm):
             ways_of(self.planner_ways, self.policy.planner.config.to_dict(), "iql")  # refuses what V(s) cannot score
             watcher = self._begin_offline(dataset, total, callback, tb_log_name, True, progress_bar)
             self._check_decider(self.policy.planner.config.decided_by)
-            # An actor of the steps before, as a trial may have chosen, would leave all that is learned here aside
-            self.policy.planner.config = replace(self.policy.planner.config, decided_by="plan")
+            # An actor of the steps before would leave all that is learned here aside
+            config = replace(self.policy.planner.config, decided_by="plan")
+            if self.planner_ways and self._planner_trained_at > 0:
+                config = untried(config)
+            is_another = config.mask != self.policy.planner.config.mask
+            self.policy.take_planner(self.policy.new_planner(config) if is_another else self.policy.planner, config)
             self.value = "iql"
             self.policy.set_value("iql")
             trainer, values = self.make_planner_trainer(total), self._make_value_trainer()
@@ -222,6 +228,7 @@ class PlannerLearner(OfflineAlgorithm):
                 raise KeyboardInterrupt
             watcher.on_training_start(locals() | {"total_timesteps": total, "callback": watcher}, globals())
 
+        self._planner_trained_at = 0  # a trial's choice is undone, what is set from now on stays
         first = trainer.n_updates + 1
 
         def on_step(n_updates: int) -> bool:
@@ -305,12 +312,14 @@ class PlannerLearner(OfflineAlgorithm):
         """Take back what a training from logs changes before its first update, if it gets no further."""
         names = "replay_buffer", "num_timesteps", "value"
         before, policy = {name: getattr(self, name) for name in names}, self.policy
-        values, config, scale = policy.values, policy.planner.config, get_statistics(self._vec_normalize_env)
+        values, planner, scale = policy.values, policy.planner, get_statistics(self._vec_normalize_env)
+        config = planner.config
         try:
             yield
         except BaseException:
             for name, value in before.items():
                 setattr(self, name, value)
-            policy.values, policy.planner.config = values, config
+            policy.values = values
+            policy.take_planner(planner, config)
             set_statistics(self._vec_normalize_env, scale)
             raise

@@ -92,6 +92,12 @@ def in_way(own: PlannerConfig, settings: dict[str, Any]) -> PlannerConfig:
         return replace(own, **{"decided_by": "plan", "present": PlannerConfig.present, **settings})
 
 
+def untried(config: PlannerConfig) -> PlannerConfig:
+    """Return a planner's settings as they are before a trial has chosen among ways."""
+    mask = PlannerConfig.mask if config.mask == "own" else config.mask
+    return replace(config, **{name: getattr(PlannerConfig, name) for name in SAMPLING_SETTINGS}, mask=mask)
+
+
 def _configs(model: SAID) -> dict[str, PlannerConfig]:
     """Return the planner's settings in each of the agent's ways to decide."""
     return {name: in_way(model.policy.planner.config, settings) for name, settings in model.planner_ways.items()}

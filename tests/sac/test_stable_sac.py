@@ -476,7 +476,9 @@ def test_beside_vec_normalize():
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"policy_delay": 0}, "policy_delay must be at least 1, got 0"),
+        ({"policy_delay": 0}, "policy_delay must be a whole number, at least 1, got 0"),
+        ({"policy_delay": 1.5}, "policy_delay must be a whole number, at least 1, got 1.5"),
+        ({"first_gamma": 0.9, "first_gamma_steps": -5}, "first_gamma_steps must be a whole number, at least 1, got -5"),
         ({"actor_averaging": 1.0}, r"actor_averaging is a decay in \[0, 1\), got 1.0"),
         ({"actor_averaging": -0.1}, "got -0.1"),
         ({"first_gamma": 1.5}, r"first_gamma is a discount in \[0, 1\], got 1.5"),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from kill import Kill, Killed
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, CheckpointCallback
 from stable_baselines3.common.logger import DISABLED, KVWriter, Logger
 
 from sb3_said import SAID, DelayedObservationWrapper, PlannerTrainingCallback
@@ -135,6 +135,22 @@ def test_learning_on_and_counting_anew(trainings):
     assert len(trainings) == 4
     model.learn(50)  # steps 0 to 50 again, on top of the 100 stored
     assert begun(trainings)[4:] == [140, 150]
+
+
+def test_a_second_learn_begins_with_random_actions_and_says_so_where_it_ends_there(trainings):
+    model = make(planner_train_freq=10).learn(40)
+    trainings.clear()
+    with pytest.warns(UserWarning, match="random actions, which the newest 15 steps are: .* reset_num_timesteps=False"):
+        model.learn(15)
+    assert begun(trainings) == [55]  # rows stored
+
+
+def test_an_agent_that_was_saved_amid_learning_collects_before_its_planner_is_trained(trainings, tmp_path):
+    make(planner_train_freq=30).learn(65, CheckpointCallback(30, str(tmp_path)))
+    trainings.clear()
+    loaded = SAID.load(tmp_path / "rl_model_60_steps.zip", env=make().env, device="cpu")
+    loaded.learn(15, reset_num_timesteps=False)
+    assert begun(trainings) == [1, 15] and loaded.num_timesteps == 75
 
 
 def test_a_callback_of_the_users_is_the_one_that_trains(trainings, tmp_path):

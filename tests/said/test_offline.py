@@ -93,7 +93,7 @@ def test_a_number_of_updates_may_be_written_as_a_float():
 def test_another_training_on_a_log_is_not_taken_for_one_on_random_actions():
     model = make().learn_offline(log(), 3)
     with warnings.catch_warnings():
-        warnings.filterwarnings("error", message="The expert has not learned")
+        warnings.filterwarnings("error", message="The planner imitates random")
         model.train_planner()
     assert model.policy.planner_updates > 0
 

@@ -17,6 +17,7 @@ from sb3_said.planner import trainer as trainer_module
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.said import trial, ways
 from sb3_said.said.training import PLANNER_CHECKPOINT_NAME, SECOND_CHECKPOINT_NAME
+from sb3_said.said.ways import DEFAULT_WAY
 
 WAYS = {
     "first": {"mask": "random", "temperature": 0.0, "present": "guessed"},
@@ -85,6 +86,24 @@ def test_the_agent_keeps_the_planner_that_does_best(monkeypatch, updates, tmp_pa
     assert loaded.planner_kwargs["mask"] == "own" and loaded.planner_ways == WAYS
     obs = pendulum(delay=(0, 2)).reset(seed=1)[0]
     np.testing.assert_array_equal(answer(loaded, obs), answer(model, obs))
+
+
+def test_on_logs_what_a_trial_chose_before_is_undone(monkeypatch, updates):
+    rig(monkeypatch, "own_ages")
+    model = make_two(planner_trial_episodes=3)
+    model.learn(60)
+    chosen, obs = model.policy.planner, pendulum(delay=(0, 2)).reset(seed=1)[0]
+    before = answer(model, obs)
+    with pytest.raises(ValueError, match="dataset"):
+        model.learn_offline(np.zeros(3))
+    assert model.policy.planner is chosen and np.array_equal(answer(model, obs), before)
+    updates.clear()
+    model.learn_offline(model.replay_buffer, 3)
+    assert updates == ["random"] * 3 and model.policy.planner is not chosen
+    assert {name: getattr(model.policy.planner.config, name) for name in DEFAULT_WAY} == DEFAULT_WAY
+    assert model.policy.planner.config.present == "guessed"
+    model.set_planner(temperature=0.7)
+    assert model.learn_offline(model.replay_buffer, 3).planner_kwargs["temperature"] == 0.7
 
 
 def test_a_training_in_a_folder_is_gone_on_with_whichever_planner_the_agent_kept(monkeypatch, updates, tmp_path):
