@@ -74,9 +74,13 @@ def check_writable(target: str | os.PathLike[str]) -> None:
     _refuse_folder(target)
     if os.path.isfile(target) or not os.path.exists(target):
         folder = Path(target).parent
-        folder.mkdir(parents=True, exist_ok=True)
-        with TemporaryFile(dir=folder):
-            pass
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with TemporaryFile(dir=folder):
+                pass
+        except OSError as error:
+            error.filename = os.fspath(target)  # and not that of the file that was tried
+            raise
 
 
 def _refuse_folder(target: str | os.PathLike[str]) -> None:

@@ -101,6 +101,8 @@ def explained(parser: argparse.ArgumentParser, goes_on: bool = False) -> Iterato
     """
     try:
         yield
+    except gym.error.UnregisteredEnv as error:
+        parser.error(f"{error} A package that registers a task is named with --gym-packages.")
     except (ValueError, gym.error.Error) as error:
         parser.error(str(error))
     except (ImportError, OSError) as error:

@@ -102,9 +102,12 @@ def make_card(
     who = run.model.policy.who_answers if hasattr(run.model.policy, "who_answers") else None
     answered = [cell for cell in cells if cell.answer == who and not cell.age_error]
     if not answered:
+        asked = dict.fromkeys(str(cell.delay) for cell in results.cells)
+        words = ["over-delays", f"X={file}", "--delays", *asked, "--episodes", str(results.settings["n_episodes"])]
+        words += ["--seed", str(results.settings["seed"]), "--json", str(results.path)]
+        lacking = f"as its {who}, who answers in it" if cells else "as it is now"
         raise ValueError(
-            f"{results.path} holds no returns of {file} as it is now: play it with sb3-said over-delays X={file} "
-            f"--json {results.path} first."
+            f"{results.path} holds no returns of {file} {lacking}: play it with sb3-said {shlex.join(words)} first."
         )
     env_id, returns = run.info["env"], np.concatenate([cell.result["returns"] for cell in answered if cell.result])
     delays = ", ".join(str(cell.delay) for cell in answered)

@@ -38,6 +38,9 @@ def main() -> None:
     sys.argv = [f"sb3-said {name}", *rest]
     try:
         command = importlib.import_module(f"sb3_said.zoo.{name.replace('-', '_')}")
+    except KeyboardInterrupt:  # it takes seconds
+        print("\nInterrupted.", file=sys.stderr)
+        sys.exit(130)
     except ModuleNotFoundError as error:
         missing = str(error.name).partition(".")[0]
         if missing == "sb3_said":

@@ -184,10 +184,7 @@ def main(argv: list[str] | None = None) -> None:
             raise ValueError(f"--noise is a standard deviation, 0 or more, got {wrong[0]}.")
         check_target(args.output)
         th.set_num_threads(args.num_threads)
-        try:
-            shares = list(open_agents(args))
-        except gym.error.Error as error:
-            raise ValueError(f"{error} A package that registers a task is named with --gym-packages.") from error
+        shares = list(open_agents(args))
         if args.steps < len(shares):
             raise ValueError(f"--steps is {args.steps}, fewer than there are shares, {len(shares)}.")
         parts: list[list[Episode]] = []

@@ -11,6 +11,7 @@ from sb3_said.delays.space import written_ages
 from sb3_said.files.atomic import check_writable
 from sb3_said.files.normalization import normalization_file
 from sb3_said.planner.config import SAMPLING_SETTINGS
+from sb3_said.said.policies import Answer
 from sb3_said.zoo.arguments import TRUST, explained, make_parser
 from sb3_said.zoo.folder import find_agent, find_normalization
 from sb3_said.zoo.runs import ANSWERS, changes
@@ -87,7 +88,7 @@ def main(argv: list[str] | None = None) -> None:
         model = load_said(args.agent)
         model.set_planner(**settings)
         if sets_answer:
-            model.set_answer(args.answer or model.policy.who_answers, *expert_ages)
+            let_answer(model, args.answer or model.policy.who_answers, *expert_ages)
         if args.output is not None:
             check_writable(args.output)
     config = model.policy.planner.config
@@ -105,6 +106,16 @@ def main(argv: list[str] | None = None) -> None:
     print(f"{'answers':14} {who}{f': the expert at ages {ages}' * (who == 'both')}{'  (new)' * sets_answer}")
     if args.output is not None:
         hand_on(model, args.agent, args.output, args.compact)
+
+
+def let_answer(model: SAID, who: Answer, up_to: int | None, since: int | None) -> None:
+    """Let one of them answer, or both, each at ages of its own.
+
+    :raises ValueError: for both without an age, or an age without both
+    """
+    if (who == "both") != (up_to is not None or since is not None):
+        raise ValueError("--answer both and --expert-up-to or --expert-from need each other.")
+    model.set_answer(who, up_to, since)
 
 
 def hand_on(model: SAID, agent: Path, output: Path, compact: bool) -> None:

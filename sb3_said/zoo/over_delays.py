@@ -8,13 +8,15 @@ import itertools
 import multiprocessing
 import os
 import re
+import shlex
+import signal
 import threading
 import warnings
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -199,11 +201,12 @@ def play_missing(args: argparse.Namespace, delays: list[int | str]) -> list[Cell
             print(f"{cell.agent} cannot play delay {cell.column}: {cell.obstacle}.")
     print(f"{len(todo)} of {len(cells)} cells to play")
     made = origin(first)
-    for done, (cell, summary) in enumerate(play_all(todo, settings["env"], args), 1):
-        result = summary.to_dict()
-        del result["label"]  # another call can give the agent another one
-        results.add(cell, result, made)
-        print(f"{done}/{len(todo)} {cell.agent}, delay {cell.column}: {summary.mean_return}", flush=True)
+    with closing(play_all(todo, settings["env"], args)) as played:
+        for done, (cell, summary) in enumerate(played, 1):
+            result = summary.to_dict()
+            del result["label"]  # another call can give the agent another one
+            results.add(cell, result, made)
+            print(f"{done}/{len(todo)} {cell.agent}, delay {cell.column}: {summary.mean_return}", flush=True)
     results.write()
     print(f"Wrote {args.json}")
     return cells
@@ -230,12 +233,12 @@ def open_runs(args: argparse.Namespace) -> dict[str, list[LoadedRun]]:
         if any(digest_of(run) == digest_of(other) for other in row):
             raise ValueError(
                 f"The label {label} has the agent {run.info['file']} twice: give it other training seeds of the same "
-                f"setting, or give each run its own label, as in LABEL={path}."
+                f"setting, or give each run its own label, as in {shlex.quote(f'LABEL={path}')}."
             )
         if row and not given:
             raise ValueError(
                 f"{path} and {row[0].info['file']} would both be called {label}: give each its own label, as in "
-                f"LABEL={path}, or one label to training seeds of one setting."
+                f"{shlex.quote(f'LABEL={path}')}, or one label to training seeds of one setting."
             )
         row.append(run)
     tasks = sorted({run.info["env"] for row in runs.values() for run in row})
@@ -323,8 +326,11 @@ def obstacle(run: LoadedRun, answer: str | None, delay: int | str, age_error: in
     return None
 
 
-def play_all(cells: list[Cell], env_id: str, args: argparse.Namespace) -> Iterator[tuple[Cell, Summary]]:
-    """Play cells, in processes if more than one are to be played at once; yields them as they are done."""
+def play_all(cells: list[Cell], env_id: str, args: argparse.Namespace) -> Generator[tuple[Cell, Summary], None, None]:
+    """Play cells, in processes if more than one are to be played at once; yields them as they are done.
+
+    Whatever ends it earlier, as Ctrl-C does, ends the processes, too.
+    """
     how = (env_id, args.episodes, args.seed, args.n_envs, args.device, args.gym_packages)
     if args.workers == 1:
         yield from ((cell, play(cell, *how)) for cell in cells)
@@ -343,12 +349,17 @@ def play_all(cells: list[Cell], env_id: str, args: argparse.Namespace) -> Iterat
             "A worker was ended, perhaps for lack of memory: give fewer --workers. What was played is kept, and the "
             "same command goes on."
         ) from error
+    except (KeyboardInterrupt, GeneratorExit):
+        for worker in multiprocessing.active_children():  # each may have minutes of its cell before it
+            worker.terminate()
+        raise
     finally:
         pool.shutdown(cancel_futures=True)
 
 
 def begin_worker(num_threads: int) -> None:
     """Prepare a process that plays cells: with so many threads, and for no longer than the one that asks it to."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; a pool would go on with the next cells
     th.set_num_threads(num_threads)
     parent = multiprocessing.parent_process()
     assert parent is not None  # for mypy: a pool calls this

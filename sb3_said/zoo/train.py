@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import secrets
+import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -102,7 +103,8 @@ def main(argv: list[str] | None = None) -> None:
     with explained(parser):
         run, algo, zoo_argv = read_command_line(argv)
     if run.resume is not None and len(argv) <= 2 and (run.resume / ENDED_NAME).is_file():  # nothing else is asked for
-        print(f"{run.resume} has ended, and nothing is left to do. sb3-said evaluate {run.resume} plays its agent.")
+        play = shlex.join(["sb3-said", "evaluate", str(run.resume)])
+        print(f"{run.resume} has ended, and nothing is left to do. {play} plays its agent.")
         if algo == "said" and run.dataset:
             print("For more updates of a planner from logs start a new run: its learning rate falls over all of them.")
         else:
@@ -126,7 +128,8 @@ def main(argv: list[str] | None = None) -> None:
     except (AssertionError, ImportError, ValueError, *OF_CODE) as error:
         if made:
             raise
-        parser.error(str(error))  # of the options that rl_zoo3 reads, some of which it evaluates
+        mend = ": install it, or name the folder that it lies in with PYTHONPATH." * isinstance(error, ImportError)
+        parser.error(f"{error}{mend}")  # of the options that rl_zoo3 reads, some of which it evaluates
     except KeyboardInterrupt:  # before or behind the training, which ends on its own
         parser.exit(130, "\nInterrupted.\n")
     finally:
@@ -157,7 +160,8 @@ def read_command_line(argv: list[str]) -> tuple[Run, str, list[str]]:
     if options.resume is not None:
         record = Record.read(options.resume)
         if (settings := options.resume / TUNED_SETTINGS).is_file():
-            raise ValueError(f"{options.resume} is what sb3-said tune found, and no training: give -conf {settings}.")
+            use = shlex.join(["-conf", str(settings)])
+            raise ValueError(f"{options.resume} is what sb3-said tune found, and no training: give {use}.")
         fixed = {"--algo": options.algo, "--delay": delay, "--expert-delay": expert_delay, "--preset": options.preset}
         fixed |= {"--seed": options.seed, "--env": options.env, "--dataset": options.dataset or None}
         fixed |= of_the_start(zoo_argv)

@@ -25,7 +25,7 @@ from sb3_said.zoo.arguments import TRUST, check_positive, device, explained, mak
 from sb3_said.zoo.best import write_best
 from sb3_said.zoo.depths import DepthPlanners
 from sb3_said.zoo.evaluate import evaluate, print_table
-from sb3_said.zoo.folder import TUNED_NAME, TUNED_SETTINGS
+from sb3_said.zoo.folder import TUNED_NAME, TUNED_SETTINGS, resuming
 from sb3_said.zoo.record import RECORD_NAME, Record
 from sb3_said.zoo.runs import LoadedRun, answers, load_run, origin
 from sb3_said.zoo.search import (
@@ -188,7 +188,8 @@ def open_run(args: argparse.Namespace) -> tuple[LoadedRun, SAID]:
     if not Record.read(args.run).dataset and not (args.run / CHECKPOINT_NAME).is_file():
         raise ValueError(
             f"{args.run} has no {CHECKPOINT_NAME}, whose replay the planners are trained on; give the folder that the "
-            "training left, and finish the run if it was stopped: sb3-said train --resume RUN_DIR"
+            "training left, and finish the run if it was stopped: "
+            f"sb3-said train {resuming(args.run)}"
         )
     if run.normalize is not None:  # the bound method of the run's VecNormalize, which the replay needs too
         run.model._vec_normalize_env = run.normalize.__self__  # type: ignore[attr-defined]

@@ -13,7 +13,7 @@ import sys
 import pytest
 
 from sb3_said.files import atomic as files
-from sb3_said.files.atomic import remove_abandoned, replacing, write_json, write_text
+from sb3_said.files.atomic import check_writable, remove_abandoned, replacing, write_json, write_text
 
 
 def test_texts_and_documents_in_folders_that_are_made(tmp_path):
@@ -42,6 +42,13 @@ def test_a_pipe_is_written_to_and_stays(tmp_path):
         write_text(pipe, "text")
         assert reader.read() == "text"
     assert pipe.is_fifo() and list(tmp_path.iterdir()) == [pipe]
+
+
+@pytest.mark.parametrize("name", ["file/below", "file/below/that"])
+def test_what_cannot_be_written_is_named_before(name, tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match=f"'{tmp_path}/{name}'"):
+        check_writable(tmp_path / name)
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):

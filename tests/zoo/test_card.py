@@ -67,7 +67,25 @@ def test_returns_of_another_file_are_refused(run: Path, tmp_path: Path, capsys: 
     decide.main([str(run), "--compact", "-o", str(agent)])
     with pytest.raises(SystemExit):
         card.main([str(agent), "--run", str(run), "--returns", str(returns)])
-    assert "holds no returns of" in capsys.readouterr().err
+    told = f"holds no returns of {agent} as it is now: play it with sb3-said over-delays X={agent} --delays 0"
+    assert f"{told} --episodes 2 --seed 10000 --json {returns} first" in capsys.readouterr().err
+
+
+def test_returns_of_another_answer_alone_are_no_others(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    agent, returns = tmp_path / "my agent.zip", tmp_path / "returns.json"
+    decide.main([str(run), "--answer", "planner", "-o", str(agent)])
+    shared = ["--delays", "0", "UniformDelay(0, 2)", "--episodes", "2", "--device", "cpu", "--json", str(returns)]
+    over_delays.main([f"x={agent}", *shared, "--answer", "expert"])
+    with pytest.raises(SystemExit):
+        card.main([str(agent), "--run", str(run), "--returns", str(returns)])
+    told = capsys.readouterr().err
+    assert "holds no returns of" in told and "as its planner, who answers in it: play it with" in told
+    command = shlex.split(told.partition("play it with sb3-said over-delays ")[2].removesuffix(" first.\n"))
+    over_delays.main([*command, "--device", "cpu"])
+    card.main([str(agent), "--run", str(run), "--returns", str(returns)])
+    assert agent.with_suffix(".md").is_file()
 
 
 def test_the_command_has_what_is_not_the_presets() -> None:

@@ -58,6 +58,15 @@ def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPat
     )
 
 
+def test_ctrl_c_while_it_imports_is_no_traceback() -> None:
+    code = "import importlib, signal, sys; sys.argv = ['sb3-said', 'evaluate']\n"
+    code += "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    code += "importlib.import_module = lambda name: signal.raise_signal(signal.SIGINT)\n"
+    code += "from sb3_said.zoo.cli import main; main()"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=120)
+    assert done.returncode == 130 and done.stderr == "\nInterrupted.\n"
+
+
 def test_the_wheel_holds_every_package_and_the_presets() -> None:
     setup = ConfigParser()
     setup.read(ROOT / "setup.cfg")

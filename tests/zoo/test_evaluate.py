@@ -214,7 +214,10 @@ def test_an_agent_of_sb3_itself_is_not_opened(run: Path, tmp_path: Path) -> None
     [
         (["--delay", "5"], "built for delays 0..2"),
         (["--env", "Hopper-v5"], "observation_space shapes"),
-        (["--env", "Pendulun-v1"], "Did you mean: `Pendulum`?"),
+        (
+            ["--env", "Pendulun-v1"],
+            "Did you mean: `Pendulum`? A package that registers a task is named with --gym-packages",
+        ),
         (["--episodes", "0"], "at least 1"),
         (["--algo", "nonsense"], "give --algo"),
         (["--period", "0.02"], "needs --realtime"),

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import warnings
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -367,6 +368,50 @@ def test_workers_end_with_a_killed_command() -> None:
     # The worker holds the pipe, too, so reading it ends with the worker
     killed = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, timeout=120)
     assert killed.returncode == -signal.SIGKILL
+
+
+def test_ctrl_c_ends_workers_amid_their_cells(said: Path, tmp_path: Path) -> None:
+    """A terminal sends it to all: workers would go on with the next cells, and the command wait for them."""
+    words = [
+        f"x={said}",
+        "--delays",
+        "0",
+        "1",
+        "--workers",
+        "2",
+        "--device",
+        "cpu",
+        "--json",
+        str(tmp_path / "out.json"),
+    ]
+    code = f"""
+import time
+from signal import SIGINT, default_int_handler, signal
+from sb3_said.zoo import over_delays
+
+def begin(*_):
+    print("begun", flush=True)
+    time.sleep(1000)
+
+if __name__ == "__main__":
+    signal(SIGINT, default_int_handler)  # which a background job of a shell ignores
+    over_delays.play = begin
+    over_delays.main({words!r})
+"""
+    (script := tmp_path / "command.py").write_text(code)
+    command, pipe = [sys.executable, "-u", str(script)], subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, start_new_session=True) as process:
+        assert process.stdout is not None
+        try:
+            while (line := process.stdout.readline()) != "begun\n":
+                assert line, "it has ended"
+            os.killpg(process.pid, signal.SIGINT)
+            printed, told = process.communicate(timeout=120)
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+    assert process.returncode == 130 and "Interrupted. Give the same command again" in told, told
+    assert "Traceback" not in told and printed.count("begun") <= 1, printed  # two of the four cells
 
 
 def test_a_delay_written_in_two_ways_is_played_once(

@@ -419,7 +419,7 @@ def test_the_expert_can_learn_under_another_delay(tmp_path: Path, monkeypatch: p
         ("--algo said --delay 4 -optimize", "with --algo stable -optimize, and the planner's with sb3-said tune"),
         ("--env Pendulun-v1", "you maybe meant Pendulum-v1?"),
         ("-i nowhere.zip", "must be a valid path to a .zip file"),
-        ("--gym-packages not_there", "No module named 'not_there'"),
+        ("--gym-packages not_there", "No module named 'not_there': install it, or name the folder"),
         ("--checkpoint-freq 0", "--checkpoint-freq must be at least 1, got 0"),
         ("-params gamma:O.9", "invalid syntax"),
         ("-n 0", "steps are a whole number, at least 1; -1 takes the preset's, got 0"),
