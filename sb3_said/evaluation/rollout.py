@@ -70,16 +70,18 @@ def rollout(
     :param normalize: applied to batched observations before ``predict``, such as ``VecNormalize.normalize_obs``
     :param on_step: called with the environment after every step, for instance to render it
     :param on_episode: called with (episode, return, length) after every episode, in the order in which they end
-    :raises ValueError: when ``n_episodes`` or ``n_envs`` is not positive, or a return is not finite
+    :raises ValueError: when ``n_episodes`` or ``n_envs`` is not positive, ``env`` returns one environment twice, a
+        return is not finite, or ``normalize`` is missing for a model that learned with ``VecNormalize``
     """
     if n_episodes < 1 or n_envs < 1:
         raise ValueError(f"n_episodes and n_envs must be at least 1, got n_episodes={n_episodes}, n_envs={n_envs}.")
+    normalize = normalize or _as_they_are(model)
     returns, lengths = np.zeros(n_episodes), np.zeros(n_episodes, np.int64)
     ended, changes = np.zeros(n_episodes, bool), np.zeros(n_episodes)
     before: dict[int, np.ndarray] = {}  # the last action of each episode that is played
     call_seconds: list[float] = []
     batch_sizes: list[int] = []
-    envs = [_make(env) for _ in range(min(n_envs, n_episodes))]
+    envs = _make_all(env, min(n_envs, n_episodes))
     half_range = _half_range(envs[0].action_space)
     try:
         playing = [(e, episode, e.reset(seed=seed + episode)[0]) for episode, e in enumerate(envs)]
@@ -87,7 +89,7 @@ def rollout(
         state: State = None
         while playing:
             batch = _stack([observation for _, _, observation in playing])
-            batch = batch if normalize is None else normalize(batch)
+            batch = normalize(batch)
             episode_start = np.array([lengths[episode] == 0 for _, episode, _ in playing])
 
             began = time.perf_counter()
@@ -200,6 +202,19 @@ def measure_latency(
 
 def _make(env: EnvMaker) -> gym.Env[Any, Any]:
     return gym.make(env) if isinstance(env, str) else env()
+
+
+def _make_all(env: EnvMaker, n_envs: int) -> list[gym.Env[Any, Any]]:
+    envs = [_make(env) for _ in range(n_envs)]
+    if len({id(one.unwrapped) for one in envs}) < n_envs:
+        raise ValueError(f"env returned one environment twice, and {n_envs} play at once: make a new one at each call.")
+    return envs
+
+
+def _as_they_are(model: PolicyPredictor) -> Callable[[Observation], Observation]:
+    if getattr(model, "reads_normalized", False):
+        raise ValueError("This model learned with VecNormalize: give rollout(..., normalize=venv.normalize_obs).")
+    return lambda observation: observation
 
 
 def _monitored(env: gym.Env[Any, Any], counted: float) -> float:

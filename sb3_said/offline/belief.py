@@ -186,7 +186,7 @@ class BeliefOnly:
     :param actor: anything with SB3's ``predict`` and ``observation_space``: an agent of a task without delay, or one of
         ours under delay, which is shown the believed state at age 0
     :param device: of the belief
-    :raises ValueError: for an actor of other observations
+    :raises ValueError: for an actor of other observations, or one that learned with ``VecNormalize``
     """
 
     def __init__(self, belief: Belief, actor: Any, device: th.device | str = "cpu"):
@@ -194,6 +194,8 @@ class BeliefOnly:
         is_delayed = isinstance(space, spaces.Dict) and "action_history" in space.spaces
         if not (isinstance(space, spaces.Box) or is_delayed):
             raise ValueError(f"The actor reads {space}; expected states, or those of a DelayedObservationWrapper.")
+        if getattr(actor, "reads_normalized", False):
+            raise ValueError("The actor learned with VecNormalize, whose scale a belief has not: train one without.")
         self.belief, self.actor, self.device = belief, actor, th.device(device)
         self.age_0_spaces = {key: box for key, box in space.items() if key != "observation"} if is_delayed else None
 

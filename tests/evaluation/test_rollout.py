@@ -218,6 +218,23 @@ def test_hooks_normalisation_and_closing() -> None:
     assert Countdown.made == Countdown.closed == 2
 
 
+def test_a_model_of_normalised_observations_needs_their_scale() -> None:
+    model = Model()
+    model.reads_normalized = True
+    with pytest.raises(ValueError, match=r"normalize=venv\.normalize_obs"):
+        rollout(model, Countdown, 1, SEED)
+    assert len(rollout(model, Countdown, 1, SEED, normalize=lambda x: x).returns) == 1
+
+
+def test_one_environment_is_not_played_twice_at_once() -> None:
+    env = Countdown()
+    with pytest.raises(ValueError, match="env returned one environment twice"):
+        rollout(Model(), lambda: env, 2, SEED, n_envs=2)
+    with pytest.raises(ValueError, match="env returned one environment twice"):
+        rollout(Model(), lambda: Monitor(env), 2, SEED, n_envs=2)
+    assert len(rollout(Model(), lambda: env, 2, SEED).returns) == 2
+
+
 def test_a_registered_task_by_its_id() -> None:
     from stable_baselines3 import PPO
     from stable_baselines3.common.evaluation import evaluate_policy

@@ -197,5 +197,7 @@ def test_an_actor_of_ours_is_asked_at_age_0(state_history, recwarn):
 def test_what_does_not_fit_is_refused():
     with pytest.raises(ValueError, match="expected states, or those of a DelayedObservationWrapper"):
         BeliefOnly(Truth(), type("Other", (), {"observation_space": None})())
+    with pytest.raises(ValueError, match="The actor learned with VecNormalize"):
+        BeliefOnly(Truth(), type("Scaled", (Sees,), {"reads_normalized": True})())
     with pytest.raises(ValueError, match=r"serves delays up to 3, but the action history has 2 rows"):
         BeliefOnly(Truth(), Sees()).predict(delayed(2).reset(seed=0)[0])
