@@ -135,7 +135,7 @@ def test_what_is_not_finite_ends_the_search_and_is_tried_again(tmp_path: Path) -
 
 
 def test_what_cannot_be_played_is_told_with_its_settings(tmp_path: Path) -> None:
-    model = Mock(predict=lambda obs, **_: (np.zeros((len(obs), 1)), None))
+    model = Mock(["predict"], predict=lambda obs, **_: (np.zeros((len(obs), 1)), None))
     task = TransformReward(gym.make("Pendulum-v1", max_episode_steps=2), lambda _: float("nan"))
     agent = Agent(lambda **_: rollout(model, lambda: task, 1, seed=7).returns[0])
     told = r"^With depth 2, temperature 0\.5, .*: Episode 0 \(seed 7\) returned nan"
