@@ -135,6 +135,8 @@ def load_run(
     if unknown:  # an agent of SB3 itself would run code of its file
         names = ", ".join(ALGORITHMS)
         raise ValueError(f"The algorithm of {file} is not known ({unknown[0]}): give --algo, one of {names}.")
+    if own_algo and algo not in (None, own_algo):
+        warnings.warn(f"{file} is of {own_algo!r}, as it says itself: --algo {algo} changes nothing.", stacklevel=2)
     algo, env_id = str(own_algo or algo), env_id or own_task
     if env_id is None:
         raise ValueError(f"The task of {file} is not known: no run folder is around it, and it names none. Give --env.")
