@@ -29,7 +29,6 @@ RANGES: dict[str, tuple[float, float]] = {
     "batch_size": (1, 1e7),
     "tau": (0, 1),
     "gamma": (0, 1),
-    "first_gamma": (0, 1),
     "train_freq": (1, _LARGEST),
     "gradient_steps": (-1, _LARGEST),
     "target_update_interval": (1, _LARGEST),

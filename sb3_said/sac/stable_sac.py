@@ -46,16 +46,11 @@ class StableSAC(DelayedSAC):
     :param actor_averaging: decay of the actor's average in each of its updates, in [0, 1); 0 for no average
     :param ent_coef: SAC's, in units of scaled rewards
     :param target_entropy: SAC's; ``"half"`` is -act_dim / 2, ``"auto"`` is -act_dim
-    :param first_gamma: discount of the first ``first_gamma_steps`` steps, ``gamma`` where it is None. Over a shorter
-        horizon an agent learns sooner to move where standing still pays, too; the longer one then has it fall less
-        (Ant-v5, one seed, results/stable_expert.md; BBF's rises, too, https://arxiv.org/abs/2305.19452)
-    :param first_gamma_steps: environment steps that it holds for
     :param critic_layer_norm: a LayerNorm follows each hidden layer of the critics, which bear ``gradient_steps=2`` with
         it (DroQ, https://arxiv.org/abs/2110.02034). HalfCheetah-v5, whose episodes do not end by a fall, learns
         faster with it; Hopper-v5 does not, and Walker2d-v5 falls for longer (results/stable_expert.md)
     :param sac_kwargs: every other argument of :class:`DelayedSAC`
-    :raises ValueError: as ``DelayedSAC`` does, and for a ``policy_delay``, an ``actor_averaging`` or a
-        ``first_gamma`` out of range
+    :raises ValueError: as ``DelayedSAC`` does, and for a ``policy_delay`` or an ``actor_averaging`` out of range
     """
 
     policy: DelayedSACPolicy
@@ -72,20 +67,13 @@ class StableSAC(DelayedSAC):
         actor_averaging: float = 0.9998,
         ent_coef: str | float = "auto_0.01",
         target_entropy: str | float = "half",
-        first_gamma: float | None = None,
-        first_gamma_steps: int = 100_000,
         critic_layer_norm: bool = False,
         **sac_kwargs: Any,
     ):
-        for name, count in (("policy_delay", policy_delay), ("first_gamma_steps", first_gamma_steps)):
-            if count < 1 or count % 1 != 0:
-                raise ValueError(f"{name} must be a whole number, at least 1, got {count}.")
+        if policy_delay < 1 or policy_delay % 1 != 0:
+            raise ValueError(f"policy_delay must be a whole number, at least 1, got {policy_delay}.")
         if not 0.0 <= actor_averaging < 1.0:
             raise ValueError(f"actor_averaging is a decay in [0, 1), got {actor_averaging}.")
-        if first_gamma is not None and not 0.0 <= first_gamma <= 1.0:
-            raise ValueError(f"first_gamma is a discount in [0, 1], got {first_gamma}.")
-        self.first_gamma = first_gamma
-        self.first_gamma_steps = first_gamma_steps
         self.scale_rewards = scale_rewards
         self.normalise_states = normalise_states
         self.policy_delay = policy_delay
@@ -94,13 +82,6 @@ class StableSAC(DelayedSAC):
         self._running_returns = np.zeros(1)  # (n_envs,) G_t of the episodes that are being played
         self._paid = np.zeros(1)  # (n_envs,) the same, undiscounted and in the task's own rewards
         super().__init__(policy, env, learning_rate, ent_coef=ent_coef, target_entropy=target_entropy, **sac_kwargs)
-
-    @property
-    def discount(self) -> float:
-        """The discount of rewards at this step of training."""
-        if self.first_gamma is None or self.num_timesteps >= self.first_gamma_steps:
-            return self.gamma
-        return self.first_gamma
 
     def _setup_model(self) -> None:
         if self.target_entropy == "half":
@@ -169,7 +150,7 @@ class StableSAC(DelayedSAC):
         row = replay_buffer.pos - 1
         begins = replay_buffer.steps[row] == 0  # (n_envs,), as the replay saw it
         if self.policy.return_scale is not None:
-            self._running_returns = reward + self.discount * np.where(begins, 0.0, self._running_returns)
+            self._running_returns = reward + self.gamma * np.where(begins, 0.0, self._running_returns)
             self.policy.return_scale.update(self._running_returns)
         if self.policy.training_episodes is not None:
             self._paid = replay_buffer.rewards[row] + np.where(begins, 0.0, self._paid)
@@ -234,7 +215,7 @@ class StableSAC(DelayedSAC):
                 next_actions, next_log_prob = self.actor.action_log_prob(batch.next_observations)  # (B, act_dim), (B,)
                 next_q = th.cat(self.critic_target(batch.next_observations, next_actions), dim=1)  # (B, n_critics)
                 next_value = next_q.amin(1, keepdim=True) - ent_coef * next_log_prob.reshape(-1, 1)
-                target = batch.rewards / scale + (1 - batch.dones) * self.discount * next_value  # (B, 1)
+                target = batch.rewards / scale + (1 - batch.dones) * self.gamma * next_value  # (B, 1)
             q = th.stack(self.critic(batch.observations, batch.actions))  # (n_critics, B, 1)
             critic_loss = 0.5 * (q - target).square().mean(1).sum()
             self.critic.optimizer.zero_grad()
@@ -272,8 +253,6 @@ class StableSAC(DelayedSAC):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/ent_coef", float(self._ent_coef()))
         self.logger.record("train/reward_scale", float(scale))
-        if self.first_gamma is not None:
-            self.logger.record("train/discount", self.discount)
         if episodes is not None:
             self.logger.record("train/average_waits", float(waits))
         for name, values in losses.items():

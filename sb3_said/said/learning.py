@@ -35,7 +35,6 @@ class PlannerLearner(OfflineAlgorithm):
     """An agent with a planner, which it trains; :class:`~sb3_said.said.SAID` sets what is declared here."""
 
     policy: SAIDPolicy
-    discount: float
     planner_gradient_steps: int
     planner_train_freq: int | None
     planner_newest_fraction: float
@@ -59,9 +58,7 @@ class PlannerLearner(OfflineAlgorithm):
         replay, newest, env = self.replay_buffer, self.newest_fraction, self._vec_normalize_env
         source = replay.window_source(newest, env)
         has_older = len(source) < replay.size() * replay.n_envs  # a log's replay has one, whatever the agent has
-        # Critics know no logs, and while first_gamma holds another horizon
-        is_valued = self.has_expert and not replay.holds_logs and self.discount == self.gamma
-        bootstrap = self._stored_values if is_valued else None
+        bootstrap = self._stored_values if self.has_expert and not replay.holds_logs else None  # critics know no logs
         values = returns_to_go(source, self.gamma, self.planner_terminal_penalty, bootstrap)
         return PlannerTrainer(
             planner or self.policy.planner,

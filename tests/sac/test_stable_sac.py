@@ -145,18 +145,6 @@ def test_values_are_in_the_units_of_rewards(task, reward):
     assert model._stored_values(states, batch.actions).shape == values.shape
 
 
-def test_a_first_discount_holds_for_its_steps_and_the_other_from_there_on():
-    kwargs = {"gamma": 0.8, "first_gamma": 0.5, "first_gamma_steps": 200}
-    model = make(with_rewards(7.0), cls=SAID, **kwargs, ent_coef=0.0, tau=0.1, learning_rate=1e-2, batch_size=32)
-    for n_steps, discount, worth in ((190, 0.5, 7 / (1 - 0.5)), (400, 0.8, 7 / (1 - 0.8))):
-        model.learn(n_steps - model.num_timesteps, reset_num_timesteps=False)
-        batch = model.replay_buffer.sample(200)
-        with th.no_grad():
-            values = model.policy.q_value(batch.observations, batch.actions)
-        np.testing.assert_allclose(values, worth, rtol=0.15)
-        assert model.discount == discount
-
-
 def test_what_actor_and_critics_read_of_states():
     model = make(delayed(3)).learn(60)
     normalizer, batch = model.policy.state_normalizer, model.replay_buffer.sample(8).observations
@@ -478,10 +466,8 @@ def test_beside_vec_normalize():
     [
         ({"policy_delay": 0}, "policy_delay must be a whole number, at least 1, got 0"),
         ({"policy_delay": 1.5}, "policy_delay must be a whole number, at least 1, got 1.5"),
-        ({"first_gamma": 0.9, "first_gamma_steps": -5}, "first_gamma_steps must be a whole number, at least 1, got -5"),
         ({"actor_averaging": 1.0}, r"actor_averaging is a decay in \[0, 1\), got 1.0"),
         ({"actor_averaging": -0.1}, "got -0.1"),
-        ({"first_gamma": 1.5}, r"first_gamma is a discount in \[0, 1\], got 1.5"),
     ],
 )
 def test_settings_out_of_range(given, message):

@@ -565,5 +565,3 @@ def test_windows_weigh_what_rewards_and_critics_add_up_to():
     expected = expected[source.rows]
     np.testing.assert_allclose(source.values, (expected - expected.min()) / np.ptp(expected), atol=1e-5)
     assert trainer.generator.initial_seed() == 3
-    model.first_gamma, model.first_gamma_steps = 0.5, 100  # under another discount critics know another worth
-    assert (model.make_planner_trainer().source.values == 1).all()  # 1 / (1 - 0.9) of every step
