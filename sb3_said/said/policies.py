@@ -233,7 +233,8 @@ class SAIDPolicy(DelayedSACPolicy):
             raise ValueError(f"Only the 'planner', the 'expert', 'both' or a 'student' can answer, got {who!r}.")
         if who == "both" and not self._ages_are_shared:
             raise ValueError(
-                "Up to which age is the expert to answer? Call set_answer('both', expert_up_to=...) first."
+                "Up to which age is the expert to answer? Call set_answer('both', expert_up_to=...) first, or sb3-said "
+                "decide --answer both --expert-up-to AGE."
             )
         if who in ("planner", "both") and not self.planner_is_trained:
             raise ValueError("The planner is not trained yet; call learn() or train_planner() first.")

@@ -28,6 +28,7 @@ RECORD_NAME = "run.json"
 ENDED_NAME = "ended.json"  # of a training that was not interrupted
 GIVEN_NAME = "given.zip"  # the agent that a run began with (-i): it may be moved, or written over, before a resume
 WRAPPER = "sb3_said.delays.DelayedObservationWrapper"
+TO_IMPORT = "install it, or name the folder that it lies in with PYTHONPATH."
 
 #: rl_zoo3's options that a resume keeps, by their whole names; those that it evaluates or runs are not among them.
 _OPTIONS = (
@@ -224,8 +225,7 @@ def import_packages(names: Iterable[str]) -> None:
             if error.name != name.partition(".")[0]:
                 raise
             raise ImportError(
-                f"The task comes from the package {name!r}, which cannot be imported here: install it, or name the "
-                "folder that it lies in with PYTHONPATH."
+                f"The task comes from the package {name!r}, which cannot be imported here: {TO_IMPORT}"
             ) from error
 
 

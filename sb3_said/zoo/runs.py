@@ -244,12 +244,7 @@ def answering(model: BaseAlgorithm, answer: str | None, at_once: bool = False) -
         return nullcontext()
     if not hasattr(model.policy, "answering"):
         raise ValueError(f"This {type(model).__name__} cannot answer as {answer!r}: only a SAID agent has an expert.")
-    policy: Any = model.policy
-    if answer == "both" and policy.planner_is_trained and answer not in policy.answers:
-        raise ValueError(
-            "Up to which age is the expert to answer? sb3-said decide --answer both --expert-up-to AGE says."
-        )
-    context: AbstractContextManager[Any] = policy.answering(answer, at_once)
+    context: AbstractContextManager[Any] = model.policy.answering(answer, at_once)  # type: ignore[operator]
     return context
 
 

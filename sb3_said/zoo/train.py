@@ -20,7 +20,7 @@ from sb3_said.zoo.folder import TUNED_SETTINGS
 from sb3_said.zoo.manager import ALGORITHMS, ALGOS, DelayedExperimentManager, Run
 from sb3_said.zoo.offline import OfflineExperimentManager
 from sb3_said.zoo.presets import PRESETS
-from sb3_said.zoo.record import ENDED_NAME, Record
+from sb3_said.zoo.record import ENDED_NAME, TO_IMPORT, Record
 
 EXAMPLES = """
 examples:
@@ -128,7 +128,7 @@ def main(argv: list[str] | None = None) -> None:
     except (AssertionError, ImportError, ValueError, *OF_CODE) as error:
         if made:
             raise
-        mend = ": install it, or name the folder that it lies in with PYTHONPATH." * isinstance(error, ImportError)
+        mend = f": {TO_IMPORT}" * isinstance(error, ImportError)
         parser.error(f"{error}{mend}")  # of the options that rl_zoo3 reads, some of which it evaluates
     except KeyboardInterrupt:  # before or behind the training, which ends on its own
         parser.exit(130, "\nInterrupted.\n")

@@ -159,7 +159,8 @@ def test_a_new_training_gives_the_planner_another_chance(monkeypatch):
 
 def test_an_expert_without_updates_is_not_tried(monkeypatch):
     monkeypatch.setattr(trial, "play_trial", lambda *_: pytest.fail("played"))
-    with pytest.warns(UserWarning, match="which the newest 60 steps are: .* learning_starts=1000 .* longer[.]"):
+    told = r"random actions, which the newest 60 steps are: .* learning_starts=1000 of them\. Learn for longer\."
+    with pytest.warns(UserWarning, match=told):
         model = make(env=pendulum(), planner_trial_episodes=2, learning_starts=1000).learn(60)
     assert model.policy.who_answers == "planner"
 

@@ -17,7 +17,6 @@ from sb3_said.planner import trainer as trainer_module
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.said import trial, ways
 from sb3_said.said.training import PLANNER_CHECKPOINT_NAME, SECOND_CHECKPOINT_NAME
-from sb3_said.said.ways import DEFAULT_WAY
 
 WAYS = {
     "first": {"mask": "random", "temperature": 0.0, "present": "guessed"},
@@ -100,7 +99,7 @@ def test_on_logs_what_a_trial_chose_before_is_undone(monkeypatch, updates):
     updates.clear()
     model.learn_offline(model.replay_buffer, 3)
     assert updates == ["random"] * 3 and model.policy.planner is not chosen
-    assert {name: getattr(model.policy.planner.config, name) for name in DEFAULT_WAY} == DEFAULT_WAY
+    assert {name: getattr(model.policy.planner.config, name) for name in ways.DEFAULT_WAY} == ways.DEFAULT_WAY
     assert model.policy.planner.config.present == "guessed"
     model.set_planner(temperature=0.7)
     assert model.learn_offline(model.replay_buffer, 3).planner_kwargs["temperature"] == 0.7

@@ -372,18 +372,7 @@ def test_workers_end_with_a_killed_command() -> None:
 
 def test_ctrl_c_ends_workers_amid_their_cells(said: Path, tmp_path: Path) -> None:
     """A terminal sends it to all: workers would go on with the next cells, and the command wait for them."""
-    words = [
-        f"x={said}",
-        "--delays",
-        "0",
-        "1",
-        "--workers",
-        "2",
-        "--device",
-        "cpu",
-        "--json",
-        str(tmp_path / "out.json"),
-    ]
+    words = ["--delays", "0", "1", "--workers", "2", "--device", "cpu", "--json", str(tmp_path / "out.json")]
     code = f"""
 import time
 from signal import SIGINT, default_int_handler, signal
@@ -396,7 +385,7 @@ def begin(*_):
 if __name__ == "__main__":
     signal(SIGINT, default_int_handler)  # which a background job of a shell ignores
     over_delays.play = begin
-    over_delays.main({words!r})
+    over_delays.main({[f"x={said}", *words]!r})
 """
     (script := tmp_path / "command.py").write_text(code)
     command, pipe = [sys.executable, "-u", str(script)], subprocess.PIPE
