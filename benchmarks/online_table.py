@@ -9,6 +9,7 @@ SAID       both, each at its ages, where an agent's file shares them between pla
            the expert of files after --expert-answers, whose trial found it better
 intervals  95 %, by a bootstrap that draws training seeds, then episodes of each; of one seed over its episodes
 SAID more  SAID's return less its expert's, from the same reset seeds
+the same, by t   with its interval by Student's t over training seeds, which is wider for few
 seeds      their own means over fixed delays, in the order of the files
 falls      part of all episodes that the task ended
 change     of the actions, from step to step
@@ -21,13 +22,13 @@ With --each the table has rows of every training seed by itself.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from measure import print_table
 
-from sb3_said.evaluation import confidence_interval, plots, stratified_interval
+from sb3_said.evaluation import Interval, confidence_interval, plots, stratified_interval
 from sb3_said.zoo.cells import Cell, Results, manners_of
 
 #: Rows of Table 1 at delays 0, 4, 8 and 16.
@@ -85,11 +86,11 @@ def gain_over(rows: Mapping[str, Seeds], delays: Sequence[int | str]) -> np.ndar
     return said - expert
 
 
-def written(returns: np.ndarray) -> str:
+def written(returns: np.ndarray, over_seeds: Callable[[np.ndarray], Interval] = stratified_interval) -> str:
     """Write the mean of (n_seeds, n_episodes) with its interval."""
     if not len(returns):
         return "-"
-    interval = confidence_interval(returns[0]) if len(returns) == 1 else stratified_interval(returns)
+    interval = confidence_interval(returns[0]) if len(returns) == 1 else over_seeds(returns)
     return f"{round(interval.value):,} [{round(interval.low):,}, {round(interval.high):,}]"  # which writes no -0
 
 
@@ -111,8 +112,11 @@ def show(found: Mapping[str, Mapping[str, Seeds]]) -> None:
                 "change": "-" if manners.change is None else f"{manners.change:.3f}",
             }
             table.append({"task": env, "agent": row, **{name: cells[name] for name in columns}})
-        gains = {name: written(gain_over(rows, of)) if of else "-" for name, of in over.items()}
-        table.append({"task": env, "agent": "SAID more", **{name: gains.get(name, "") for name in columns}})
+        gains = {name: gain_over(rows, of) for name, of in over.items() if of}
+        ways = {"SAID more": stratified_interval, "the same, by t": confidence_interval}
+        for row, over_seeds in ways.items() if len(rows[SAID]) > 1 else [("SAID more", stratified_interval)]:
+            cells = {name: written(gain, over_seeds) for name, gain in gains.items()}
+            table.append({"task": env, "agent": row, **{name: cells.get(name, "") for name in columns}})
         paper = dict(zip(PAPER_DELAYS, PAPER.get(env, ()), strict=False))
         if paper:
             told = {str(d): f"{mean:,} ± {error}" for d, (mean, error) in paper.items()}
@@ -156,12 +160,14 @@ def plot(found: Mapping[str, Mapping[str, Seeds]], path: Path) -> None:
 def main(argv: list[str] | None = None) -> dict[str, dict[str, Seeds]]:
     """Print the table, draw the plot, and return what was read."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("files", nargs="+", type=Path, metavar="JSON")
+    p.add_argument("files", nargs="*", type=Path, metavar="JSON")
     p.add_argument("--expert-answers", nargs="+", type=Path, default=[], metavar="JSON", help="files of agents that "
                    "answer by their expert")  # fmt: skip
     p.add_argument("--each", action="store_true", help="rows of every training seed by itself")
     p.add_argument("--plot", type=Path, metavar="PNG", help="draw return over fixed delays, a panel for each task")
     args = p.parse_args(argv)
+    if not [*args.files, *args.expert_answers]:
+        p.error("Expected files of sb3-said over-delays, got none.")
     try:
         found = read(args.files, args.expert_answers)
     except ValueError as error:

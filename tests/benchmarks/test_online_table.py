@@ -25,9 +25,9 @@ def write(path: Path, cells: list[dict[str, Any]], **settings: Any) -> str:
     return str(path)
 
 
-def seed(sha256: str, answer: str, mean: float) -> list[dict[str, Any]]:
-    """An agent that plays delays 0 and 8 and a random one; its expert returns 100 less."""
-    whos = ((answer, mean), ("expert", mean - 100))
+def seed(sha256: str, answer: str, mean: float, gain: float = 100.0) -> list[dict[str, Any]]:
+    """An agent that plays delays 0 and 8 and a random one; its expert returns less."""
+    whos = ((answer, mean), ("expert", mean - gain))
     return [cell(sha256, who, d, m - less) for who, m in whos for d, less in ((0, 0), (8, 40), ("WIFI_20MS", 200))]
 
 
@@ -52,7 +52,8 @@ def test_rows_are_worked_out_by_hand(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert columns["falls"] == ["50.0%"] * 2 and columns["change"] == ["0.100"] * 2
     gain = "100 [100, 100]"
     assert lines[4] == ["Hopper-v5", "SAID more", gain, gain, gain, gain, "", gain]
-    assert lines[5][:4] == ["Hopper-v5", "SAID, paper", "3,170 ± 283", "2,514 ± 415"]
+    assert lines[5] == ["Hopper-v5", "the same, by t", *lines[4][2:]]
+    assert lines[6][:4] == ["Hopper-v5", "SAID, paper", "3,170 ± 283", "2,514 ± 415"]
     assert (tmp_path / "agents.png").read_bytes()[:4] == b"\x89PNG"
 
 
@@ -74,12 +75,24 @@ def test_every_seed_by_itself_is_the_table_of_its_file_alone(
     assert together[0].split(" | ")[2].startswith("1,000 [") and together[3].split(" | ")[2].startswith("3,000 [")
 
 
+def test_what_said_has_more_has_students_t_over_seeds_as_well(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    online_table.main([
+        write(tmp_path / f"{name}.json", seed(name, "planner", 1000.0, gain), env="Own-v0")
+        for name, gain in (("a", 100.0), ("b", 150.0), ("c", 200.0))
+    ])  # fmt: skip
+    by_t = capsys.readouterr().out.splitlines()[5].strip("| ").split(" | ")
+    assert by_t[:3] == ["Own-v0", "the same, by t", "150 [26, 274]"]  # 4.303 * 50 / sqrt(3) = 124
+
+
 def test_an_agent_that_its_trial_lets_the_expert_answer_is_its_expert(tmp_path: Path) -> None:
     ours = write(tmp_path / "a.json", seed("a", "planner", 1000.0))
     theirs = write(tmp_path / "b.json", seed("b", "planner", 3000.0))
     found = online_table.main([ours, "--expert-answers", theirs])["Hopper-v5"]
     means = {row: online_table.returns_over(seeds, [0]).mean(1).tolist() for row, seeds in found.items()}
     assert means == {"SAID": [1000.0, 2900.0], "its expert": [900.0, 2900.0]}
+    assert len(online_table.main(["--expert-answers", theirs])["Hopper-v5"]["SAID"]) == 1
     found = online_table.main([theirs, ours, "--expert-answers", theirs])["Hopper-v5"]  # in the order of all
     means = {row: online_table.returns_over(seeds, [0]).mean(1).tolist() for row, seeds in found.items()}
     assert means == {"SAID": [2900.0, 1000.0], "its expert": [2900.0, 900.0]}
@@ -103,3 +116,6 @@ def test_what_cannot_be_compared_is_refused(tmp_path: Path, capsys: pytest.Captu
         with pytest.raises(SystemExit):
             online_table.main([first, write(tmp_path / f"{name}.json", cells, **settings)])
         assert said in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        online_table.main([])
+    assert "Expected files of sb3-said over-delays" in capsys.readouterr().err
