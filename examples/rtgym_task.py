@@ -29,7 +29,7 @@ def play(interface: Any, loop: ControlLoop, n_steps: int) -> float:
     loop.wait()  # the robot still stands, so the first action may be a planned one
     total = 0.0
     try:
-        for k, now in enumerate(ticks(loop.period)):
+        for k, _ in enumerate(ticks(loop.period)):
             if k > 0:
                 captured = time.monotonic()  # or what the sensor says; before the call, which may take its time
                 observation, reward, terminated, _ = interface.get_obs_rew_terminated_info()
@@ -37,7 +37,7 @@ def play(interface: Any, loop: ControlLoop, n_steps: int) -> float:
                 loop.observe(flat(observation), captured)
                 if terminated or k == n_steps:
                     return total
-            interface.send_control(loop.act(now))
+            interface.send_control(loop.act())
     finally:
         interface.send_control(interface.get_default_action())
     return total

@@ -1,7 +1,7 @@
 """A robot on a serial port: python serial_robot.py agent.zip /dev/ttyACM0 0.02
 
-The robot sends lines "N x1 x2 ...": the number of the command that it executed last, and its state. It gets lines
-"N a1 a2 ...", executes the newest at its next control step, and starts counting from 0 when the port is opened."""
+In a control step the robot reads its sensors, sends a line "N x1 x2 ..." of the number of the command that it executed
+in the step before and its state, and executes the newest "N a1 a2 ..." that came. It counts from the port's opening."""
 
 import sys
 import threading
@@ -13,13 +13,14 @@ from sb3_said import SAID
 from sb3_said.realtime import ControlLoop, ModelProcess, ticks
 
 
-def listen(port, loop):
+def listen(port, loop, line=b""):
     while port.is_open:
         try:
-            if line := port.readline():  # nothing where the robot is silent for a second
-                number, *state = line.split()
+            line += port.readline()  # a part where the robot is silent for a second
+            if line.endswith(b"\n"):
+                (number, *state), line = line.split(), b""
                 loop.observe([float(x) for x in state], n_executed=int(number))
-        except (ValueError, TypeError) as error:  # half a line, a sensor that fails, or the port is being closed
+        except (ValueError, TypeError) as error:  # a disturbed line, a sensor that fails, or the port is being closed
             print(f"Nothing observed: {error}", file=sys.stderr)
 
 
@@ -28,9 +29,8 @@ def main(agent, device, period):
         with serial.Serial(device, 115200, timeout=1, write_timeout=1) as port:
             threading.Thread(target=listen, args=(port, loop), daemon=True).start()
             try:
-                for now in ticks(period):
-                    action = loop.act(now)
-                    port.write(f"{loop.n_sent} {' '.join(map(str, action))}\n".encode())
+                for _ in ticks(period):
+                    port.write(f"{loop.n_sent + 1} {' '.join(map(str, loop.act()))}\n".encode())
             finally:  # Ctrl-C, or no answer for too long
                 port.write(f"{loop.n_sent + 1} {' '.join(map(str, loop.safe_action))}\n".encode())
                 print(loop.statistics())

@@ -52,9 +52,10 @@ class Ledger:
 
     :param state_space: (obs_dim,)
     :param action_space: (act_dim,)
+    :param period: from one action to the next, in the unit of the stamps
     :param max_delay: D, largest age that the model reads
     :param max_age: largest age of an observation to act on
-    :param action_delay: from sending an action to its effect, in the unit of the stamps
+    :param action_delay: from sending an action to its effect, in that unit
     :param hold_steps: steps in a row to repeat the last action
     :param safe_action: (act_dim,), sent after that, and at first
     """
@@ -63,6 +64,7 @@ class Ledger:
         self,
         state_space: spaces.Box,
         action_space: spaces.Box,
+        period: float,
         max_delay: int,
         max_age: int,
         action_delay: float,
@@ -70,7 +72,8 @@ class Ledger:
         safe_action: np.ndarray,
     ):
         self.state_space, self.action_space = state_space, action_space
-        self.max_delay, self.max_age, self.action_delay = max_delay, max_age, action_delay
+        self.period, self.action_delay = period, action_delay
+        self.max_delay, self.max_age = max_delay, max_age
         self.hold_steps, self.safe_action = hold_steps, safe_action
         self.episode = -1
         self.start_episode(math.nan)
@@ -100,8 +103,8 @@ class Ledger:
 
         :param observation: (obs_dim,)
         :param capture_time: when it was captured; None if unknown
-        :param n_executed: how many actions were executed before it was captured; by default those that took effect
-            before ``capture_time``
+        :param n_executed: how many actions show in it; by default those that had acted for more than half a period at
+            ``capture_time``, so that an age is rounded to the nearest
         :param latest: time of the latest capture that can be; NaN if unknown
         :raises ValueError: for what is no state, or for more actions than were sent
         """
@@ -119,8 +122,11 @@ class Ledger:
             if is_repeated or capture_time < self.captured or capture_time > latest:
                 return False
         if n_executed is None:
-            later = takewhile(lambda effect: effect >= capture_time, reversed(self._effects))  # type: ignore[operator]
-            n_executed = self.n_sent - sum(1 for _ in later)
+            assert capture_time is not None  # one of the two is given
+            shown = capture_time - self.period / 2
+            n_executed = self.n_sent - sum(
+                1 for _ in takewhile(lambda effect: effect >= shown, reversed(self._effects))
+            )
         elif not (0 <= n_executed <= self.n_sent and n_executed == int(n_executed)):
             raise ValueError(
                 f"The observation says that {n_executed} actions were executed, but {self.n_sent} were sent since "

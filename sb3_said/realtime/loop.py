@@ -115,7 +115,7 @@ class ControlLoop:
         self._changed = threading.Condition(threading.Lock())
         hold = math.inf if hold_steps is None else hold_steps
         max_age = max_delay if max_age is None else max_age
-        self._ledger = Ledger(state_space, space, max_delay, max_age, action_delay, hold, safe)
+        self._ledger = Ledger(state_space, space, period, max_delay, max_age, action_delay, hold, safe)
         self._statistics = LoopStatistics()
         self._acted = self._offset = math.nan  # when, and how far that clock is ahead of the monotonic one
         self._is_closing = self._has_heard = self._has_warned = False  # an observation since the last act
@@ -160,26 +160,29 @@ class ControlLoop:
             default; in a simulation none is dropped by default
         :raises ValueError: for what is no time
         """
-        began = math.nan if now is None and self._simulate is not None else _time(now)
         with self._changed:
+            clock = time.monotonic()
+            began = math.nan if now is None and self._simulate is not None else _time(now, clock)
             self._ledger.start_episode(began)
             self._is_due, self._has_heard, self._asked, self._in_flight = False, False, None, None
             self._stands = False
-            self._note(began)
+            self._note(began, clock)
             self._changed.notify_all()
 
     def observe(self, observation: Any, capture_time: float | None = None, n_executed: int | None = None) -> None:
         """Take an observation, from any thread; one that is no younger than the one at hand is dropped.
 
-        Its age is the number of the newest actions that do not show in it: those that took effect at its capture or
-        later. Stamps and ``now`` must be of one clock. What is stamped more than two periods ahead of now is dropped,
-        too, since it would make all that follows look old. The first such stamp, or one far behind, is warned of.
+        Its age is the number of the newest actions that do not show in it: those that had acted for half a period or
+        less at its capture. Stamps and ``now`` must be of one clock. What is stamped more than two periods ahead of now
+        is dropped, too, since it would make all that follows look old. The first such stamp, or one far behind, is
+        warned of.
 
         :param observation: (obs_dim,), in the units of the task; copied
         :param capture_time: when it was captured. The same stamp twice is a sensor that froze: its observation ages. By
             default ``time.monotonic()``, unless ``n_executed`` is given
-        :param n_executed: number of the action that was executed last before the capture, 0 before the first. It
-            counts better than a stamp, since no command's time on its way has to be known
+        :param n_executed: number of the newest action that shows in it, 0 before the first: of a robot that reads its
+            sensors and then executes a command, the number of the one before. It counts better than a stamp, since no
+            command's time on its way has to be known
         :raises ValueError: for what is no finite observation, or for more actions than were sent
         """
         if capture_time is None and n_executed is None:
@@ -196,22 +199,25 @@ class ControlLoop:
             warn, self._has_warned = is_odd and not self._has_warned, is_odd or self._has_warned
         if warn:
             warnings.warn(
-                f"An observation was captured at {capture_time:.3f}, but now it is {now:.3f}: a sensor that froze, or "
-                "another clock than that of act(now) and reset(now). This is said once; stale_observations counts on.",
+                f"An observation was captured at {capture_time:.3f}, but now it is {now:.3f}: a sensor that froze, "
+                "another clock than that of act(now) and reset(now), or a now that was taken long before act(now): "
+                "leave it out. This is said once; stale_observations counts on.",
                 stacklevel=2,
             )
 
     def act(self, now: float | None = None) -> np.ndarray:
         """Return the action to send now, and count it as sent.
 
-        :param now: ``time.monotonic()`` by default; or a count of steps, which makes a simulation independent of clocks
+        :param now: ``time.monotonic()`` at this call by default; or a count of steps, which makes a simulation
+            independent of clocks
         :return: (act_dim,), in the units of the action space
         :raises NoAnswer: where no action has been planned for too long; nothing counts as sent
         :raises RuntimeError: where the model has failed, or the loop is closed
         :raises ValueError: for what is no time, or where stamps and the first ``now`` are of different clocks
         """
-        now = _time(now)
         with self._changed:
+            clock = time.monotonic()  # and not before: another thread may hold the lock for a while
+            now = _time(now, clock)
             self._check()
             if (ahead := (self._ledger.captured - now) / self.period) > AHEAD:
                 if ahead > FAR and math.isnan(self._acted):
@@ -232,7 +238,7 @@ class ControlLoop:
             if not self._has_heard:  # ask again: the same observation is a step older
                 self._ask()
             self._has_heard = self._stands = False
-            self._note(now)
+            self._note(now, clock)
             return step.action.copy()
 
     def wait(self, timeout: float | None = None) -> bool:
@@ -282,10 +288,10 @@ class ControlLoop:
         self._check()
         return is_answered
 
-    def _note(self, now: float) -> None:
+    def _note(self, now: float, clock: float) -> None:
         self._acted = now
         if self._simulate is None:  # else time goes on in act alone
-            self._offset = now - time.monotonic()
+            self._offset = now - clock
 
     def _ask(self) -> None:
         """Say what an idle worker is asked; a busy one will be asked when it has answered.
@@ -385,9 +391,9 @@ class ControlLoop:
         self._expect(math.ceil(seconds / self.period) if self._simulate is None else int(self._simulate(seconds)))
 
 
-def _time(now: float | None) -> float:
-    """Return ``now``, which is ``time.monotonic()`` by default."""
-    now = time.monotonic() if now is None else float(now)
+def _time(now: float | None, clock: float) -> float:
+    """Return ``now``, which is the clock's time by default."""
+    now = clock if now is None else float(now)
     if not math.isfinite(now):
         raise ValueError(f"now is {now}, expected a finite time.")
     return now

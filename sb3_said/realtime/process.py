@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection
+from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ class ModelProcess:
 
     :param load: makes the model; a function that another process can import, such as
         ``functools.partial(SAID.load, "agent.zip", device="cpu")``
+    :raises ValueError: for what is no function, or cannot be handed to another process, such as a lambda
     :raises RuntimeError: where the model cannot be loaded; the message holds the reason
 
     >>> if __name__ == "__main__":  # doctest: +SKIP
@@ -32,6 +34,16 @@ class ModelProcess:
     """
 
     def __init__(self, load: Callable[[], Any]):
+        try:
+            ForkingPickler.dumps(load)
+            reason = None if callable(load) else "it is no function"
+        except Exception as error:  # pickle has many kinds
+            reason = str(error)
+        if reason is not None:
+            raise ValueError(
+                f"{load!r} cannot load a model in another process ({reason}): give "
+                'functools.partial(SAID.load, "agent.zip", device="cpu"), or a function at the top of a module.'
+            )
         context = multiprocessing.get_context("spawn")  # a fork would copy locks that other threads hold
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(load, theirs), name="ModelProcess", daemon=True)

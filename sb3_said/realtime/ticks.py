@@ -18,8 +18,8 @@ def ticks(
     :param clock: steady, in seconds
     :param sleep: waits for some seconds
 
-    >>> for now in ticks(0.02):  # doctest: +SKIP
-    ...     send(loop.act(now))
+    >>> for _ in ticks(0.02):  # doctest: +SKIP
+    ...     send(loop.act())
     """
     if not period > 0:
         raise ValueError(f"period is {period}, expected seconds above 0.")

@@ -139,6 +139,7 @@ def test_the_ros_node_observes_acts_and_tells_that_it_lives(ros: Any) -> None:
     assert node.published["/arm"] == [[float(plan_of(node.model.asked[-1], TASK.action_space, 1)[0, 0])]]
     assert 0.01 <= time.monotonic() - node.captured < 60
     for is_frozen, age in ((True, 1), (True, 2), (False, 0)):
+        time.sleep(0.0 if is_frozen else 0.3)  # more than half a period
         stamp = now - 10_000_000 if is_frozen else time.time_ns()
         node.subscribed["/joints"](joint_state([0.5], [0.25], stamp))
         assert node.loop._ledger.age == age
@@ -199,7 +200,7 @@ class Port:
         assert min(timeout, write_timeout) > 0
         self.device, self.commands, self.is_open = device, [], True
         self.lines: queue.Queue[bytes] = queue.Queue()
-        for line in (b"", b"gar bage\n", b"", b"0 1.0 0.5\n"):  # silent for a while at first
+        for line in (b"", b"gar bage\n", b"", b"0 1.0 0.", b"", b"25\n"):  # silent for a while, once in a line
             self.lines.put(line)
         self.opened.append(self)
 
@@ -224,11 +225,19 @@ class Port:
 def test_the_serial_robot(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     example = load("serial_robot", monkeypatch, module("serial", Serial=Port))
     assert len((EXAMPLES / "serial_robot.py").read_text().splitlines()) <= 40
+    observed, observe = [], ControlLoop.observe
+
+    def noting(loop: ControlLoop, state: list[float], n_executed: int) -> None:
+        observed.append((n_executed, state))
+        observe(loop, state, n_executed=n_executed)
+
+    monkeypatch.setattr(ControlLoop, "observe", noting)
     with pytest.raises(KeyboardInterrupt):
         example.main("agent.zip", "/dev/robot", 0.01)
     (port,) = Port.opened
     assert port.device == "/dev/robot" and [number for number, _ in port.commands] == [*range(1, 21), 21]
     assert port.commands[-1] == (21, 0.0) and len({action for _, action in port.commands}) > 1
+    assert observed[0] == (0, [1.0, 0.25])
     shown = capsys.readouterr()
     assert "steps 20" in shown.out and "b'bage'" in shown.err and "unpack" not in shown.err  # silence
     listener = next((thread for thread in threading.enumerate() if "listen" in thread.name), None)

@@ -1,6 +1,7 @@
 """Stamps that cannot be: of another episode, of another clock, ahead of now."""
 
 import math
+import threading
 import time
 import warnings
 
@@ -62,6 +63,26 @@ def test_a_stamp_ahead_of_now_is_refused_and_said_once():
         assert loop.wait(60) and 9 not in asked_for(model) and asked_for(model)[-1] == 2
         loop.observe(ZEROS + 3, time.monotonic() + period)  # clocks differ a little
         assert loop.wait(60) and asked_for(model)[-1] == 3
+
+
+def test_what_is_captured_after_an_act_that_had_to_wait_is_heard():
+    with ControlLoop(Recorder(TASK, 4), 0.01) as loop:
+        held, slow = threading.Event(), 0.1  # ten periods
+
+        def hold():
+            with loop._changed:
+                held.set()
+                time.sleep(slow)
+
+        other, began = threading.Thread(target=hold), time.monotonic()
+        other.start()
+        held.wait()
+        loop.act()
+        assert time.monotonic() - began >= slow
+        loop.observe(ZEROS)
+        other.join()
+        assert loop.statistics().stale_observations == 0
+        assert min(loop._ledger._effects) - began >= slow  # when it was sent, and not when it was asked for
 
 
 def test_a_robot_that_stands_for_long_is_heard(monkeypatch):
@@ -138,7 +159,7 @@ def test_a_simulated_clock_that_goes_back_is_followed_too():
 
 def test_a_clock_that_goes_back_leaves_the_age_as_it_is():
     """Also where actions take effect later than observations are captured."""
-    loop, ages = ControlLoop(Recorder(TASK, 8), 0.02, action_delay=0.03, answer_steps=0, **FREE), []
+    loop, ages = ControlLoop(Recorder(TASK, 8), 0.02, action_delay=0.025, answer_steps=0, **FREE), []
     now = 1000.0
     for k in range(30):
         now -= 10.0 * (k == 15)

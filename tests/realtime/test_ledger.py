@@ -16,7 +16,7 @@ SAFE = np.array([-2.0], np.float32)
 
 def make(max_delay=4, max_age=None, action_delay=0.0, hold_steps=2):
     max_age = max_delay if max_age is None else max_age
-    return Ledger(STATES, ACTIONS, max_delay, max_age, action_delay, hold_steps, SAFE)
+    return Ledger(STATES, ACTIONS, 1.0, max_delay, max_age, action_delay, hold_steps, SAFE)
 
 
 def send(ledger, n=1, now=None):
@@ -33,11 +33,15 @@ def plan(*actions):
     return np.array(actions, np.float32)[:, None]
 
 
-def test_the_age_counts_actions_that_took_effect_at_the_capture_or_later():
+def test_the_age_counts_actions_that_had_acted_for_half_a_period_or_less():
     ledger = make(action_delay=1.5)
     send(ledger, 4)  # at 0, 1, 2 and 3; they take effect at 1.5, 2.5, 3.5 and 4.5
-    assert ledger.observe([0.0], 2.5, None) and ledger.age == 3
-    assert ledger.observe([0.0], 2.6, None) and ledger.age == 2
+    assert (
+        ledger.observe([0.0], 1.6, None) and ledger.age == 4
+    )  # of the first a tenth, which is no state that it led to
+    assert ledger.observe([0.0], 2.0, None) and ledger.age == 4
+    assert ledger.observe([0.0], 2.1, None) and ledger.age == 3
+    assert ledger.observe([0.0], 3.1, None) and ledger.age == 2
     assert ledger.observe([0.0], 9.0, None) and ledger.age == 0
     send(ledger)
     assert ledger.age == 1
@@ -86,7 +90,7 @@ def test_a_stamp_does_not_bring_back_what_an_unstamped_observation_has_overtaken
     ledger = make()
     send(ledger, 4)  # at 0, 1, 2 and 3
     assert ledger.observe([1.0], 0.5, None) and ledger.observe([2.0], None, 4)
-    assert not ledger.observe([3.0], 1.5, None)  # two actions: younger than the stamped one, older than the other
+    assert not ledger.observe([3.0], 2.0, None)  # two actions: younger than the stamped one, older than the other
     assert (ledger.observation, ledger.age) == (np.float32(2.0), 0)
     assert ledger.observe([4.0], 9.0, None)
     send(ledger, 1, now=9.5)
@@ -107,7 +111,7 @@ def test_an_age_beyond_what_the_model_reads_is_counted_in_full(gaps, max_delay, 
     for now in times:
         send(ledger, 1, now)
     ledger.observe([1.0], stamp, None)
-    assert ledger.age == (times >= stamp).sum()
+    assert ledger.age == (times >= stamp - 0.5).sum()
 
 
 @pytest.mark.parametrize(

@@ -50,7 +50,7 @@ def test_a_loop_beside_a_robot_at_50_hz(by, record_property):
 
     def shown_in(observation):
         number, stamp, n_sent = received[tuple(observation)]
-        return number if "number" in by else min(bisect_left(acted, stamp), n_sent)
+        return number if "number" in by else min(bisect_left(acted, stamp - PERIOD / 2), n_sent)
 
     with ControlLoop(model, PERIOD) as loop:
         model.asked.clear()
@@ -150,6 +150,15 @@ def test_the_first_answer_is_not_what_later_ones_are_expected_to_take(where):
 def test_a_model_that_cannot_be_loaded_says_why():
     with pytest.raises(RuntimeError, match="FileNotFoundError: no such agent"):
         ModelProcess(fail)
+
+
+@pytest.mark.parametrize(
+    ("load", "reason"), [(lambda: Sum(0.5), "lambda"), (Sum(0.5), "no function"), (threading.Lock, None)]
+)
+def test_what_no_other_process_could_load_from_is_refused(load, reason):
+    with pytest.raises(ValueError if reason else RuntimeError, match=reason or "In the model's process") as refused:
+        ModelProcess(load)
+    assert reason is None or "functools.partial(SAID.load" in str(refused.value)
 
 
 def test_a_script_without_a_main_is_told_so(tmp_path):

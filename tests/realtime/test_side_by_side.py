@@ -21,6 +21,8 @@ from sb3_said.delays import (
     FixedDelay,
     PeriodicPackets,
     UniformDelay,
+    estimate_delay,
+    in_steps,
     unscale_action,
 )
 from sb3_said.delays.processes import packet_delays
@@ -45,6 +47,31 @@ def play_wrapper(task, process, n, max_delay, n_steps, decide):
         actions.append(zero if t < n else plan.pop(0))
         observations.append(env.step(actions[-1])[0])
     return observations, actions
+
+
+def play_between_the_steps(latency: float, phase: float, period: float = 0.02, n_steps: int = 800):
+    """Return the log of a robot that captures amid its steps, and the ages of a loop that it tells when that was.
+
+    The robot is x' = 25 (u - x), with random u.
+
+    :param latency: seconds from a capture to its arrival
+    :param phase: seconds from an action to the capture after it
+    """
+    task = Drift()
+    loop = ControlLoop(Recorder(task, 8), period, simulate=lambda seconds: 0)
+    rng, state, newest, packets = np.random.default_rng(SEED), 0.0, 0.0, []
+    observations, actions = [], []
+    for t in period * np.arange(n_steps):
+        while packets and packets[0][0] + latency <= t + 1e-9:
+            captured, newest = packets.pop(0)
+            loop.observe([newest, 0.0], captured)
+        loop.act(t)
+        action = rng.uniform(-1, 1)
+        observations.append([newest])
+        actions.append([action])
+        at_capture, state = (action + (state - action) * np.exp(-25 * seconds) for seconds in (phase, period))
+        packets.append((t + phase, at_capture))
+    return observations, actions[:-1], loop.statistics().ages
 
 
 def play_loop(task, process, loop, n_steps, by_number):
@@ -117,6 +144,16 @@ def _compare(name, process, n, by_number, n_steps):
     for target, asked in zip(targets, model.asked, strict=True):
         if target < n_steps:
             assert_same(asked, observations[target])
+
+
+@pytest.mark.parametrize(
+    ("latency", "phase"), [(0.036, 0.001), (0.036, 0.004), (0.036, 0.019), (0.012, 0.001), (0.012, 0.015)]
+)
+def test_stamps_tell_the_age_that_the_robots_log_has(latency, phase):
+    """Which is what its agent was trained for: one too small costs far more than one too large."""
+    observations, actions, ages = play_between_the_steps(latency, phase)
+    found = estimate_delay([np.array(observations)], [np.array(actions)])
+    assert set(ages) == {found.delay} == {in_steps(latency, 0.02)}
 
 
 @pytest.fixture(scope="module")
