@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from sb3_said.delays.observations import checked_observation
 from sb3_said.delays.space import delayed_space
 
 
@@ -39,22 +40,21 @@ class OnnxModel:
             raise ValueError(f"{path} is no file of sb3-said export, or damaged ({error}): export it again.") from error
         #: Whether it reads what VecNormalize has normalised; files of before 2026-11-26 do not say.
         self.reads_normalized = properties.get("reads_normalized") == "true"
-        self._keys = [each.name for each in self._session.get_inputs()]
         state_space = spaces.Box(-np.inf, np.inf, (self._session.get_inputs()[0].shape[1],), np.float32)
         self.observation_space: spaces.Space[Any] = state_space
-        if "delay" in self._keys:
+        if "delay" in [each.name for each in self._session.get_inputs()]:
             self.observation_space = delayed_space(state_space, self.action_space, int(properties["max_delay"]))
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[np.ndarray, None]:
-        """Answer a batch (B, ...) with actions (B, act_dim), in the units of the action space.
+        """Answer one observation, or a batch (B, ...), with actions (act_dim,) or (B, act_dim), in the task's units.
 
-        :raises ValueError: where an answer is not finite
+        :raises ValueError: as :func:`~sb3_said.delays.observations.checked_observation`, and for an answer that is
+            not finite
         """
-        parts = observation if isinstance(observation, dict) else {"observation": observation}
-        given = {key: np.asarray(parts[key], np.float32) for key in self._keys}
+        given, is_batch = checked_observation(observation, self.observation_space)
         action: np.ndarray = self._session.run(["action"], given)[0]
         if not np.isfinite(action).all():
             raise ValueError(f"The graph answers {action}, which is not finite; look at the observation: {given}.")
-        return action, None
+        return action if is_batch else action[0], None

@@ -20,6 +20,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 
+from sb3_said.delays.observations import checked_observation
 from sb3_said.delays.space import UNDELAYED, check_spaces, holds_whole_numbers, scale_action, unscale_action
 from sb3_said.files.agents import SafePolicyMixin
 from sb3_said.files.arguments import instead_of
@@ -156,7 +157,7 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
 
         :param observation: one observation or a batch of them, of any numbers
         :return: tensors with a batch dimension, and whether they had one before
-        :raises ValueError: as :meth:`obs_to_arrays`
+        :raises ValueError: as :func:`~sb3_said.delays.observations.checked_observation`
         """
         arrays, is_batch = self.obs_to_arrays(observation)
         # SB3's own method cannot reshape an action history of no actions, that of max_delay 0.
@@ -165,37 +166,8 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         return tensors if isinstance(self.observation_space, spaces.Dict) else tensors["observation"], is_batch
 
     def obs_to_arrays(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], bool]:
-        """Turn what ``predict`` was given into float32 arrays of their own memory, after checking it.
-
-        :param observation: one observation or a batch of them, of any numbers
-        :return: arrays (B, ...) by key, "observation" alone without delay, and whether there was a batch before
-        :raises ValueError: for entries that are no numbers or not finite in float32, another shape, an empty batch,
-            other keys, an age outside 0..max_delay, or a ``state_known`` other than 0 and 1
-        """
-        space = self.observation_space
-        is_delayed = isinstance(space, spaces.Dict)
-        boxes = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
-        is_dict = isinstance(observation, dict)
-        if is_dict and not is_delayed:
-            raise ValueError(
-                f"The agent was built for a task without delay, got a dict with the keys {list(observation)}; "
-                "leave DelayedObservationWrapper out."
-            )
-        if is_delayed and not (is_dict and set(observation) == set(boxes)):
-            given = f"the keys {list(observation)}" if is_dict else type(observation).__name__
-            raise ValueError(
-                f"The agent was built for dict observations with the keys {sorted(boxes)}, got {given}; "
-                "wrap the task in DelayedObservationWrapper."
-            )
-        parts = observation if isinstance(observation, dict) else {"observation": observation}
-        arrays = {key: _as_float32(key, parts[key], box) for key, box in boxes.items()}
-        batches = {key: None if x.shape == boxes[key].shape else len(x) for key, x in arrays.items()}
-        if len(set(batches.values())) > 1:
-            raise ValueError(f"The parts of an observation differ in how many there are: {batches}.")
-        if is_delayed:
-            _check_delayed(arrays, self.max_delay)
-        is_batch = batches["observation"] is not None
-        return arrays if is_batch else {key: x[None] for key, x in arrays.items()}, is_batch
+        """Check arrays or tensors as :func:`~sb3_said.delays.observations.checked_observation`."""
+        return checked_observation(observation, self.observation_space, as_array)
 
     def predict(
         self,
@@ -273,58 +245,6 @@ def as_array(given: Any) -> np.ndarray:
         given = given.detach().cpu()
         given = given.float() if given.is_floating_point() else given  # NumPy has no bfloat16
     return np.asarray(given)
-
-
-def _as_float32(name: str, given: Any, space: spaces.Space[Any]) -> np.ndarray:
-    """Copy one element of a space, or a batch, to what the networks compute in. The space's bounds are not read.
-
-    The checks follow the copy: 1e300 is infinite in float32, and noise that an observation decides must not depend on
-    the dtype it came in.
-
-    :raises ValueError: for what is no array of real numbers, another shape, an empty batch, or entries not finite
-    """
-    try:
-        array = as_array(given)
-    except ValueError as error:
-        raise ValueError(f"{name} cannot be made an array: {error}") from error
-    if array.dtype.kind not in "biuf":
-        raise ValueError(f"{name} holds {array.dtype}, expected real numbers.")
-    with np.errstate(over="ignore"):  # refused with a reason next
-        values = array.astype(np.float32)
-    if values.shape != space.shape and values.shape[1:] != space.shape:
-        raise ValueError(
-            f"{name} has the shape {values.shape}, expected {space.shape}, or (n_envs, *{space.shape}) for a batch; "
-            "the agent was built for another task, or for another largest delay, which "
-            "DelayedObservationWrapper(..., max_delay=...) gives."
-        )
-    if values.shape != space.shape and len(values) == 0:
-        raise ValueError(f"{name} is an empty batch, of shape {values.shape}; there is nothing to answer.")
-    if not np.isfinite(values).all():
-        raise ValueError(
-            f"{name} has entries that are NaN or infinite, in float32; find out where they come from first."
-        )
-    return values
-
-
-def _check_delayed(arrays: dict[str, np.ndarray], max_delay: int) -> None:
-    """Refuse ages, actions and flags that no ``DelayedObservationWrapper`` of this ``max_delay`` hands out."""
-    delay, action_history = arrays["delay"], arrays["action_history"]
-    if not ((delay >= 0) & (delay <= max_delay) & (delay % 1 == 0)).all():
-        raise ValueError(
-            f"delay runs from {delay.min():g} to {delay.max():g}, expected whole numbers in 0..{max_delay}: "
-            f"the agent was built for max_delay={max_delay}."
-        )
-    if (np.abs(action_history) > 1.0 + 1e-4).any():
-        raise ValueError(
-            f"action_history has entries of size {np.abs(action_history).max():g}, expected actions scaled to [-1, 1], "
-            "as DelayedObservationWrapper gives them."
-        )
-    known = arrays.get("state_known")
-    if known is not None and ((known != 0) & (known != 1)).any():
-        raise ValueError(
-            f"state_known runs from {known.min():g} to {known.max():g}, expected 1 where a state of state_history is "
-            "known and 0 elsewhere."
-        )
 
 
 def settings_of(cls: Any, given: dict[str, Any] | None, whose: str) -> Any:

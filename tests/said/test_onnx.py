@@ -75,11 +75,28 @@ def test_it_tells_that_it_reads_normalised_observations(tmp_path):
 
 def test_an_answer_that_is_not_finite_is_refused(tmp_path):
     model = teach(make())
+    model.policy.student.network[-2].bias.data.fill_(np.nan)
     export(model, tmp_path / "agent.onnx")
-    obs = observe()
-    obs["observation"][3] = np.nan
     with pytest.raises(ValueError, match="not finite; look at the observation"):
-        OnnxModel(tmp_path / "agent.onnx").predict(obs)
+        OnnxModel(tmp_path / "agent.onnx").predict(observe())
+
+
+def test_it_answers_and_refuses_what_the_agent_does(tmp_path):
+    model = teach(make())
+    export(model, tmp_path / "agent.onnx")
+    loaded, obs = OnnxModel(tmp_path / "agent.onnx"), observe()
+    one = {key: part[0] for key, part in obs.items()}
+    np.testing.assert_array_equal(loaded.predict(one)[0], loaded.predict(obs)[0][0])
+    for key, value in (("delay", 3), ("delay", -1), ("delay", 0.5), ("action_history", 5), ("observation", np.nan)):
+        wrong = {**obs, key: np.full_like(obs[key], value)}
+        refused = []
+        for who in (loaded, model):
+            with pytest.raises(ValueError) as error:
+                who.predict(wrong)
+            refused.append(str(error.value))
+        assert refused[0] == refused[1]
+    with pytest.raises(ValueError, match="got ndarray"):
+        loaded.predict(obs["observation"])
 
 
 def test_a_file_of_another_program_is_told(tmp_path):
