@@ -229,6 +229,7 @@ def who_answers(model: Any) -> str:
         if config.temperature:
             how += f", {config.n_candidates} candidates, "
             how += "the one of the highest value decides" if config.choice_factor is None else "weighed by their values"
+        how += " (the present inpainted)" if config.present == "inpainted" else " (from a guess of the present)"
     return (
         f"{who}{how}"
         if who == "planner"
