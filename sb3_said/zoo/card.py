@@ -225,11 +225,11 @@ def who_answers(model: Any) -> str:
         how = "'s guess of the present, at which the expert's actor decides"
     else:
         how = f" in {config.sampling_steps} denoising step{'s' * (config.sampling_steps > 1)}"
+        how += " with the present inpainted" if config.present == "inpainted" else " from a guess of the present"
         how += f" at temperature {config.temperature:g}"
         if config.temperature:
             how += f", {config.n_candidates} candidates, "
             how += "the one of the highest value decides" if config.choice_factor is None else "weighed by their values"
-        how += " (the present inpainted)" if config.present == "inpainted" else " (from a guess of the present)"
     return (
         f"{who}{how}"
         if who == "planner"

@@ -199,6 +199,10 @@ def test_the_card_says_how_candidates_decide(run: Path) -> None:
     assert card.who_answers(model).endswith("at temperature 1, 3 candidates, the one of the highest value decides")
     model.set_planner(choice_factor=1.0)
     assert card.who_answers(model).endswith("at temperature 1, 3 candidates, weighed by their values")
+    guesses = "from a guess of the present" in card.who_answers(model)
+    assert guesses == (model.policy.planner.config.present == "guessed")
+    model.set_planner(present="inpainted")
+    assert "with the present inpainted at temperature 1" in card.who_answers(model)
 
 
 def test_the_trials_steps_are_those_of_the_log(tmp_path: Path) -> None:
