@@ -152,7 +152,7 @@ def train_belief(
     optimizer = th.optim.Adam(belief.parameters(), belief.learning_rate)
     scheduler = th.optim.lr_scheduler.CosineAnnealingLR(optimizer, gradient_steps)
     for _ in tqdm(range(gradient_steps), desc=type(belief).__name__, disable=not progress_bar):
-        windows = source.sample(batch_size, belief.max_delay + 1, generator).to(device)
+        windows = source.sample(batch_size, max(belief.max_delay, 1) + 1, generator).to(device)  # a model takes a step
         loss = belief.loss(windows, generator)
         optimizer.zero_grad()
         loss.backward()

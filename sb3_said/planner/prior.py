@@ -6,6 +6,7 @@ import torch as th
 from torch import nn
 
 LEAST_STD = 0.01  # of a guess that is never wrong; in the planner's units
+FEWEST_WINDOWS = 10  # that tell how far a guess is right; of one it looks as if it were never wrong
 
 
 class Prior(nn.Module):
@@ -41,12 +42,13 @@ class Prior(nn.Module):
 
         :param guess: (M, L, n_entries), as of the next two in the planner's units
         :param clean: (M, L, n_entries), what they turned out to be
-        :param valid: (M, L) bool; steps that no window has stay as they are
+        :param valid: (M, L) bool; steps that fewer windows than ``FEWEST_WINDOWS`` have stay as they are: one alone
+            lies on its own line, as if the guess were sure
         """
         share = valid[..., None] / valid.sum(0).clamp(min=1)[:, None]  # (M, L, 1)
         slope = (share * guess * clean).sum(0) / (share * guess**2).sum(0).clamp(min=1e-12)
         std = (share * (clean - slope * guess) ** 2).sum(0).sqrt().clamp(min=LEAST_STD)
-        is_seen = valid.any(0)[:, None]
+        is_seen = (valid.sum(0) >= FEWEST_WINDOWS)[:, None]
         self.slope[delay] = th.where(is_seen, slope, self.slope[delay])
         self.std[delay] = th.where(is_seen, std, self.std[delay])
 

@@ -25,7 +25,8 @@ def returns_to_go(
     :param gamma: discount factor
     :param terminal_penalty: replaces the reward of a terminating step (paper, Table 3); None keeps it
     :param value_fn: (states (K, obs_dim), actions (K, act_dim)) -> (K,), the value of the last stored step of an
-        episode that was cut off. Without it an episode is taken to go on at its average reward
+        episode that was cut off. Without it an episode is taken to go on at its average reward, of which one shorter
+            than the horizon 1 / (1 - gamma) takes what it lacks from all: a step of a log's end tells little
     :return: (M,) float32
     :raises ValueError: for gamma = 1 without ``value_fn`` where an episode was cut off, and so has no finite value
     """
@@ -38,8 +39,10 @@ def returns_to_go(
         rewards[cut] = value_fn(source.start_states()[cut], source.start_actions()[cut]).float()
     elif gamma < 1.0:
         _, episode = source.episodes.unique(return_inverse=True)
-        means = rewards.new_zeros(int(episode.max()) + 1).index_add(0, episode, rewards) / episode.bincount()
-        rewards[cut] = means[episode[cut]] / (1.0 - gamma)
+        length, horizon = episode.bincount(), 1.0 / (1.0 - gamma)
+        lacking = (horizon - length).clamp(min=0.0)
+        sums = rewards.new_zeros(len(length)).index_add(0, episode, rewards) + lacking * rewards[~terminated].mean()
+        rewards[cut] = (sums / (length + lacking))[episode[cut]] * horizon
     elif cut.any():
         raise ValueError(
             f"An episode that goes on has a finite value only with gamma < 1, got gamma={gamma}: give a smaller "

@@ -205,7 +205,7 @@ class PlannerLearner(OfflineAlgorithm):
         """
         total = self.planner_gradient_steps if gradient_steps is None else whole("gradient_steps", gradient_steps)
         check_intervals(log_interval=log_interval, eval_interval=eval_interval, save_interval=save_interval)
-        with self._as_before_if_it_fails():
+        with self._as_before_if_it_fails() as take_back:
             ways_of(self.planner_ways, self.policy.planner.config.to_dict(), "iql")  # refuses what V(s) cannot score
             watcher = self._begin_offline(dataset, total, callback, tb_log_name, True, progress_bar)
             self._check_decider(self.policy.planner.config.decided_by)
@@ -235,7 +235,11 @@ class PlannerLearner(OfflineAlgorithm):
                 training.hand_over()
             return self._goes_on(watcher)
 
-        outcome = training.run(should_stop=should_stop, on_step=on_step)
+        try:
+            outcome = training.run(should_stop=should_stop, on_step=on_step)
+        finally:
+            if trainer.n_updates == 0:
+                take_back()
         if outcome == "stopped":
             raise KeyboardInterrupt
         watcher.on_training_end()
@@ -305,18 +309,25 @@ class PlannerLearner(OfflineAlgorithm):
         return False
 
     @contextmanager
-    def _as_before_if_it_fails(self) -> Iterator[None]:
-        """Take back what a training from logs changes before its first update, if it gets no further."""
-        names = "replay_buffer", "num_timesteps", "value"
+    def _as_before_if_it_fails(self) -> Iterator[Callable[[], None]]:
+        """Take back what a training from logs changes before its first update, if it gets no further.
+
+        It gives the function that does, for a training that ends later, before its first update.
+        """
+        names = "replay_buffer", "num_timesteps", "value", "_planner_trained_at"
         before, policy = {name: getattr(self, name) for name in names}, self.policy
         values, planner, scale = policy.values, policy.planner, get_statistics(self._vec_normalize_env)
         config = planner.config
-        try:
-            yield
-        except BaseException:
+
+        def take_back() -> None:
             for name, value in before.items():
                 setattr(self, name, value)
             policy.values = values
             policy.take_planner(planner, config)
             set_statistics(self._vec_normalize_env, scale)
+
+        try:
+            yield take_back
+        except BaseException:
+            take_back()
             raise

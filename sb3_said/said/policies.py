@@ -324,9 +324,9 @@ class SAIDPolicy(DelayedSACPolicy):
         """
         if who == "both" and isinstance(observation, dict):
             history, age = observation["action_history"], observation["delay"][:, 0].long()  # (B, D, act_dim), (B,)
-            rows, steps = th.arange(len(age), device=age.device), (self.max_delay - 1 - age).clamp(min=0)
-            led_there = history[rows, steps]  # a_{t-d-1}, zeros where s_{t-d} is s_0
-            begins, ages = ~led_there.ne(0).any(1), self.expert_ages
+            n_before = self.max_delay - age[:, None]  # of the actions a_{t-D..t-d-1}, zeros where s_{t-d} is s_0
+            has_led_there = history.ne(0).any(2) & (th.arange(self.max_delay, device=age.device) < n_before)  # (B, D)
+            begins, ages = ~has_led_there.any(1), self.expert_ages
             is_its_age = (age >= ages.start) & (age < ages.stop)
             return th.where(begins, self.max_delay in ages, is_its_age)
         n = len(observation["observation"] if isinstance(observation, dict) else observation)

@@ -67,6 +67,17 @@ def test_a_learned_belief_knows_a_deterministic_task(learned):
         assert errors[0] == pytest.approx(0, abs=1e-6) and errors == sorted(errors)  # they compound
 
 
+@pytest.mark.parametrize("kind", [RegressedPresent, RolledOutModel])
+def test_without_delay_the_present_is_what_was_seen(kind):
+    belief = kind(2, 1, 0)
+    replay = make_bc()
+    replay.take_dataset(demonstrations(4))
+    train_belief(belief, replay.replay_buffer.window_source(), 3)
+    state = th.ones(1, 2)
+    present = belief.present(state, th.zeros(1, 0, 1), th.zeros(1, dtype=th.int64)).detach()
+    assert present.shape == (1, 2) and (kind is RegressedPresent or th.allclose(present, state))
+
+
 @th.no_grad()
 def test_a_model_that_runs_away_is_stopped():
     belief = RolledOutModel(2, 1, DELAY)

@@ -39,6 +39,16 @@ def test_it_is_fitted_by_least_squares():
     th.testing.assert_close(std, th.stack([prior.std[1], th.ones(5, 3)]))
 
 
+def test_a_step_that_few_windows_have_is_not_taken_for_a_sure_one():
+    generator = th.Generator().manual_seed(0)
+    guess, clean = th.randn(1000, 4, 1, generator=generator), th.randn(1000, 4, 1, generator=generator)
+    valid = th.arange(1000)[:, None] < th.tensor([1000, 10, 2, 1])
+    prior = Prior(max_delay=0, length=4, n_entries=1)
+    prior.fit(0, guess, clean, valid)
+    assert prior.std[0, 0, 0] == pytest.approx(1, abs=0.1) and 0.4 < prior.std[0, 1, 0] < 1.6
+    assert prior.std[0, 2:].tolist() == [[1.0]] * 2 and prior.slope[0, 2:].tolist() == [[0.0]] * 2
+
+
 def test_a_guess_that_is_never_wrong_keeps_a_deviation():
     guess = th.randn(50, 2, 1, generator=th.Generator().manual_seed(0))
     prior = Prior(0, 2, 1)

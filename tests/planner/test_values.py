@@ -31,13 +31,16 @@ def make_source(episodes):
 
 
 def naive_returns(episodes, gamma, penalty, value_fn):
-    returns, index = [], 0
+    returns, index, horizon = [], 0, 1 / (1 - gamma)
+    going_on = [r for rewards, terminated in episodes for r in (rewards[:-1] if terminated else rewards)]
     for rewards, terminated in episodes:
         index += len(rewards)
         if terminated:
             tail = rewards[-1] if penalty is None else penalty
         else:
-            tail = np.mean(rewards) / (1 - gamma) if value_fn is None else 1.5 * (index - 1)
+            lacking = max(horizon - len(rewards), 0)
+            mean = (sum(rewards) + lacking * np.mean(going_on)) / (len(rewards) + lacking)
+            tail = mean * horizon if value_fn is None else 1.5 * (index - 1)
         for t in range(len(rewards)):
             value, factor = 0.0, 1.0
             for reward in rewards[t:-1]:
@@ -71,6 +74,18 @@ def test_an_endless_constant_reward_is_worth_the_geometric_series():
     # Every step of an episode cut by a time limit must look the same, near the limit or not.
     returns = returns_to_go(make_source([([3.0] * 50, False)]), 0.99)
     np.testing.assert_allclose(returns, 300.0, rtol=1e-5)
+
+
+def test_a_step_at_a_logs_end_does_not_spread_the_scale_of_all_others():
+    whole = [([1.0] * 200, False), ([0.5] * 200, False)] * 10
+    weights = []
+    for episodes in (whole, [*whole, ([5.0], False)]):
+        source = make_source(episodes)
+        weight = window_weight(scaled_values(returns_to_go(source, 0.99), "centred"), 4.0)
+        weights.append(weight[source.rows.argsort()][:4000])
+    assert th.corrcoef(th.stack(weights)).min() > 0.99
+    ratio = [float(weight[0] / weight[200]) for weight in weights]
+    assert ratio[1] > 0.5 * ratio[0] > 1000
 
 
 def test_no_discount_needs_a_value_function():

@@ -389,6 +389,25 @@ def test_a_ctrl_c_amid_an_update_ends_it_as_any_other_unless_it_came_twice(is_as
     assert model.policy.planner_updates == 2 and ended == [True] * (not is_asked)
 
 
+@pytest.mark.parametrize("is_asked", [False, True])
+def test_a_training_that_ends_before_its_first_update_leaves_a_trained_agent_as_it_was(is_asked, monkeypatch):
+    model, obs = make(planner_kwargs={"temperature": 1.0}).learn(60), observe()
+    replay, before, own = model.replay_buffer, weights(model), answer(model, obs)
+    asked = []
+
+    def interrupted(trainer):
+        asked.append(is_asked)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(PlannerTrainer, "step", interrupted)
+    with pytest.raises(KeyboardInterrupt) if is_asked else nullcontext():
+        model.learn_offline(log(), 4, should_stop=lambda: any(asked))
+    assert (model.value, model.policy.values, model.num_timesteps) == ("critics", None, 60)
+    assert model.replay_buffer is replay and model._planner_trained_at == 60
+    th.testing.assert_close(weights(model), before, rtol=0, atol=0)
+    np.testing.assert_array_equal(answer(model, obs), own)
+
+
 def test_a_failed_training_changes_nothing(monkeypatch):
     model = make(value="iql").learn(60)
     before = weights(model)

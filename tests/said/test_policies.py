@@ -469,6 +469,17 @@ def test_of_both_the_expert_answers_young_observations_and_the_planner_old_ones(
     )
 
 
+def test_an_action_of_zero_amid_an_episode_is_not_taken_for_its_start(saved):
+    model = SAID.load(saved, device="cpu")
+    one = {key: part[:1] for key, part in observe().items()} | {"delay": np.zeros((1, 1), np.float32)}
+    model.set_answer("both", expert_up_to=0)  # so that the planner begins
+    for history, who in (([0.0, 0.0], "planner"), ([0.5, 0.0], "expert"), ([0.0, 0.5], "expert")):
+        obs = one | {"action_history": np.array(history, np.float32).reshape(1, 2, 1)}
+        with model.policy.answering(who):
+            expected = answer(model, obs)
+        np.testing.assert_array_equal(answer(model, obs), expected)
+
+
 @pytest.mark.parametrize("how", [{"temperature": 0.0}, {"temperature": 1.0, "choice_factor": 1.0}])
 def test_rows_that_are_answered_at_once_are_answered_as_each_alone(saved, how):
     model, obs = SAID.load(saved, device="cpu"), observe()
