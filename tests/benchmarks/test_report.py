@@ -32,7 +32,7 @@ def test_tables_are_those_of_the_raw_files(monkeypatch, capsys):
     found = {tuple(row[:2]): dict(zip(header, row, strict=True)) for row in rows}
 
     header, _, *rows = rows_of(page, "| task | agent |")
-    assert len(rows) == 12
+    assert len(rows) == 4 * 4
     online_table.show(online_table.each_by_itself(seeds))
     each = rows_of(page[page.index("## Each training seed") :], "| task | agent |")
     assert len(each) == 2 + 12 * 3
