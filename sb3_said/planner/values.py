@@ -26,7 +26,7 @@ def returns_to_go(
     :param terminal_penalty: replaces the reward of a terminating step (paper, Table 3); None keeps it
     :param value_fn: (states (K, obs_dim), actions (K, act_dim)) -> (K,), the value of the last stored step of an
         episode that was cut off. Without it an episode is taken to go on at its average reward, of which one shorter
-            than the horizon 1 / (1 - gamma) takes what it lacks from all: a step of a log's end tells little
+        than the horizon 1 / (1 - gamma) takes what it lacks from all: a step of a log's end tells little
     :return: (M,) float32
     :raises ValueError: for gamma = 1 without ``value_fn`` where an episode was cut off, and so has no finite value
     """

@@ -205,8 +205,19 @@ def _open_storage(storage: str) -> BaseStorage:
 
 
 def _cut_unfinished_line(journal: Path) -> None:
-    """Remove what a full disk or a power cut has left of a last line, which the next one would be joined to."""
-    if journal.exists() and not (written := journal.read_bytes()).endswith(b"\n"):
+    """Remove what a full disk or a power cut has left of a last line, which the next one would be joined to.
+
+    :raises ValueError: for a file of something else
+    """
+    if not journal.exists():
+        return
+    written, begins = journal.read_bytes(), b'{"op_code"'
+    if not all(begins.startswith(line[: len(begins)]) for line in written.splitlines()):
+        raise ValueError(
+            f"--storage {journal} is no journal of Optuna: give another file, or for a data base its URL, such as "
+            f"sqlite:///{journal}."
+        )
+    if not written.endswith(b"\n"):
         os.truncate(journal, written.rfind(b"\n") + 1)
 
 

@@ -143,6 +143,14 @@ def test_what_cannot_be_played_is_told_with_its_settings(tmp_path: Path) -> None
         run(tmp_path, agent, [0.5])
 
 
+@pytest.mark.parametrize("content", [b"SQLite format 3\x00\x10\n\xfb", b"PK\x03\x04", b"notes\nof mine"])
+def test_a_file_of_something_else_is_refused_and_stays(content: bytes, tmp_path: Path) -> None:
+    (file := tmp_path / "tune.db").write_bytes(content)
+    with pytest.raises(ValueError, match=r"no journal of Optuna.*sqlite:///"):
+        search_module._open_storage(str(file))
+    assert file.read_bytes() == content
+
+
 def test_a_journal_whose_last_line_was_cut_goes_on(tmp_path: Path) -> None:
     agent = Agent(lambda temperature, **_: temperature)
     run(tmp_path, agent, [0.0, 0.5])
