@@ -8,8 +8,8 @@ Each file is of sb3-said over-delays. Agents of one task, told apart by their fi
 SAID       both, each at its ages, where an agent's file shares them between planner and expert; else the planner, or
            the expert of files after --expert-answers, whose trial found it better
 intervals  95 %, by a bootstrap that draws training seeds, then episodes of each; of one seed over its episodes
-SAID more  SAID's return less its expert's, from the same reset seeds
-the same, by t   with its interval by Student's t over training seeds, which is wider for few
+SAID more  SAID's return less its expert's, from the same reset seeds; below it the same with its interval by
+           Student's t over training seeds, which is wider for few
 seeds      their own means over fixed delays, in the order of the files
 falls      part of all episodes that the task ended
 change     of the actions, from step to step
@@ -113,8 +113,10 @@ def show(found: Mapping[str, Mapping[str, Seeds]]) -> None:
             }
             table.append({"task": env, "agent": row, **{name: cells[name] for name in columns}})
         gains = {name: gain_over(rows, of) for name, of in over.items() if of}
-        ways = {"SAID more": stratified_interval, "the same, by t": confidence_interval}
-        for row, over_seeds in ways.items() if len(rows[SAID]) > 1 else [("SAID more", stratified_interval)]:
+        ways: dict[str, Callable[[np.ndarray], Interval]] = {"SAID more": stratified_interval}
+        if len(rows[SAID]) > 1:
+            ways["the same, by t"] = confidence_interval
+        for row, over_seeds in ways.items():
             cells = {name: written(gain, over_seeds) for name, gain in gains.items()}
             table.append({"task": env, "agent": row, **{name: cells.get(name, "") for name in columns}})
         paper = dict(zip(PAPER_DELAYS, PAPER.get(env, ()), strict=False))

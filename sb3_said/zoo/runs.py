@@ -242,9 +242,10 @@ def answering(model: BaseAlgorithm, answer: str | None, at_once: bool = False) -
     """
     if answer is None:
         return nullcontext()
-    if not hasattr(model.policy, "answering"):
+    policy: Any = model.policy  # SB3's own have no answering
+    if not hasattr(policy, "answering"):
         raise ValueError(f"This {type(model).__name__} cannot answer as {answer!r}: only a SAID agent has an expert.")
-    context: AbstractContextManager[Any] = model.policy.answering(answer, at_once)  # type: ignore[operator]
+    context: AbstractContextManager[Any] = policy.answering(answer, at_once)
     return context
 
 

@@ -36,9 +36,7 @@ def plan(*actions):
 def test_the_age_counts_actions_that_had_acted_for_half_a_period_or_less():
     ledger = make(action_delay=1.5)
     send(ledger, 4)  # at 0, 1, 2 and 3; they take effect at 1.5, 2.5, 3.5 and 4.5
-    assert (
-        ledger.observe([0.0], 1.6, None) and ledger.age == 4
-    )  # of the first a tenth, which is no state that it led to
+    assert ledger.observe([0.0], 1.6, None) and ledger.age == 4  # the first has acted for a tenth, and hardly shows
     assert ledger.observe([0.0], 2.0, None) and ledger.age == 4
     assert ledger.observe([0.0], 2.1, None) and ledger.age == 3
     assert ledger.observe([0.0], 3.1, None) and ledger.age == 2
