@@ -230,7 +230,8 @@ def _refuse_pickle(is_pickle: bool) -> None:
             "it holds a pickle, as Stable-Baselines3's own files do, and unpickling runs whatever code its author put"
             " there. If you trust the author, load it with Stable-Baselines3, such as SAC.load(path), and hand over"
             " what it learned: policy.load_state_dict(loaded.policy.state_dict()), or"
-            " set_parameters(loaded.get_parameters())"
+            " set_parameters(loaded.get_parameters()). StableSAC and SAID have more than it, and learn in other units: "
+            "make them with normalise_states=False, scale_rewards=False, and add exact_match=False"
         )
 
 

@@ -48,11 +48,15 @@ def check_argument(name: str, value: Any, cls: type) -> None:
     :param cls: whose constructors they are, its own and those that it inherits
     :raises ValueError: for another type, or a number out of range
     """
-    constructors = [base.__init__ for base in cls.__mro__ if "__init__" in vars(base)]  # type: ignore[misc]
-    hints = (hint for make in constructors for parameter, hint in _hints(make).items() if parameter == name)
-    if not _fits(value, next(hints, Any)):
+    if not _fits(value, declared(name, cls)):
         raise ValueError(f"{name} is {value!r:.100}, which is not of the type that {cls.__name__} declares.")
     check_range(name, value)
+
+
+def declared(name: str, cls: type) -> Any:
+    """Return the type of an argument in the first constructor that names it; ``Any`` where none does."""
+    constructors = [base.__init__ for base in cls.__mro__ if "__init__" in vars(base)]  # type: ignore[misc]
+    return next((hint for make in constructors for argument, hint in _hints(make).items() if argument == name), Any)
 
 
 def check_range(name: str, value: Any) -> None:

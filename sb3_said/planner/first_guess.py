@@ -50,17 +50,33 @@ class FirstGuess(nn.Module):
         :param longest: an upper bound of the delays, below L
         :return: (B, L, obs_dim + act_dim), 0 where an action is known
         """
-        length, state = states.shape[1], states[:, 0]
-        guessed = [state]
-        for k in range(longest):
-            follows = self.model(state, actions[:, k])
-            follows = th.where(known[:, k + 1, None], states[:, k + 1], follows)
-            state = th.where((k < delay)[:, None], follows, state)
-            guessed.append(state)
-        guessed += [state] * (length - len(guessed))
-        is_decided = th.arange(length, device=delay.device) >= delay[:, None]  # (B, L)
-        action = self.clone(state).clamp(-1.0, 1.0)[:, None]  # (B, 1, act_dim)
-        return th.cat([th.stack(guessed, dim=1), th.where(is_decided[..., None], action, 0.0)], dim=-1)
+        return self.windows(self.roll_out(states, actions, known, longest), delay, states.shape[1])
+
+    @th.no_grad()
+    def roll_out(self, states: th.Tensor, actions: th.Tensor, known: th.Tensor, n_steps: int) -> th.Tensor:
+        """Return the states that the model makes of the first, known ones as given: (B, n_steps + 1, obs_dim).
+
+        The arguments are those of :meth:`forward`, of the actions here all that are rolled over.
+        """
+        rolled = [states[:, 0]]
+        for k in range(n_steps):
+            rolled.append(th.where(known[:, k + 1, None], states[:, k + 1], self.model(rolled[k], actions[:, k])))
+        return th.stack(rolled, dim=1)
+
+    @th.no_grad()
+    def windows(self, rolled: th.Tensor, delay: th.Tensor, length: int) -> th.Tensor:
+        """Return guesses of windows whose present is a step of what was rolled out, as :meth:`forward`.
+
+        :param rolled: (B, n_steps + 1, obs_dim)
+        :param delay: (B,) int64, at most n_steps
+        :param length: L
+        """
+        step = th.arange(length, device=delay.device)
+        index = th.minimum(step, delay[:, None])[..., None].expand(-1, -1, rolled.shape[-1])  # (B, L, obs_dim)
+        states = rolled.gather(1, index)
+        action = self.clone(states[:, -1]).clamp(-1.0, 1.0)[:, None]  # (B, 1, act_dim), of the present
+        is_decided = step >= delay[:, None]  # (B, L)
+        return th.cat([states, th.where(is_decided[..., None], action, 0.0)], dim=-1)
 
     def clone_loss(self, states: th.Tensor, actions: th.Tensor, weight: th.Tensor) -> th.Tensor:
         """Return the clone's mean squared error, in action units.

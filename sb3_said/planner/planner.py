@@ -124,14 +124,14 @@ class InpaintingPlanner(nn.Module):
 
         :param windows: of ``window_length`` steps
         """
-        assert self.prior is not None
+        assert self.prior is not None and self.first_guess is not None
         states, actions, valid, _ = windows.to(self.device)
         clean, length = self.normalizer.normalize(states, actions), self.window_length
+        z, known = self.normalizer.normalize_states(states), th.zeros_like(valid)  # beyond the first, (M, L)
+        rolled = self.first_guess.roll_out(z, actions, known, self.max_delay)  # once: a delay's is a part of it
         for d in range(self.max_delay + 1):
             delay = th.full((len(states),), d, device=self.device)
-            known = inpainting.known_mask(delay, length, self.obs_dim, self.act_dim)
-            guess = self._guess(states, actions, delay, known)
-            assert guess is not None  # for mypy: there is no prior without
+            guess = self.first_guess.windows(rolled, delay, length)
             self.prior.fit(d, self._in_units(guess), clean, valid & self._within(delay, length))
 
     def loss(

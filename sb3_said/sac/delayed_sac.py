@@ -39,7 +39,7 @@ from sb3_said.delays.space import (
 from sb3_said.delays.wrapper import DelayedObservationWrapper
 from sb3_said.files.agents import SafeSaveMixin, existing, with_suffix
 from sb3_said.files.archive import load_tree, readable, save_tree
-from sb3_said.files.checks import RANGES, check_range
+from sb3_said.files.checks import RANGES, check_argument, declared
 from sb3_said.replay.buffer import DelayedReplayBuffer, rows_for_logs
 from sb3_said.sac.policies import SERVED, DelayedSACPolicy, as_array
 
@@ -131,8 +131,11 @@ class DelayedSAC(SafeSaveMixin, SAC):
                 f"{name} learns from a DelayedReplayBuffer, got {self.replay_buffer_class.__name__}; "
                 "leave replay_buffer_class out."
             )
-        for setting in RANGES:
-            check_range(setting, getattr(self, setting, None))
+        for setting in [name for name in RANGES if hasattr(self, name)]:
+            value = getattr(self, setting)
+            check_argument(setting, value, type(self))
+            if isinstance(value, float) and declared(setting, type(self)) is int:
+                setattr(self, setting, int(value))  # such as 1e6
         own, given = {*self._policy_flags(), "relabelled_ages"}, {*self.policy_kwargs, *self.replay_buffer_kwargs}
         if twice := sorted(own & given):
             raise ValueError(f"Give {', '.join(twice)} to {name} itself, not in policy_kwargs or replay_buffer_kwargs.")
@@ -308,7 +311,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
                 f"This {type(self).__name__} was built for a task {'in' if is_delayed else 'without'} a "
                 f"DelayedObservationWrapper, got {env.observation_space}; {remedy if is_delayed else 'leave it out'}."
             )
-        own, given = self.policy.max_delay, check_spaces(env.observation_space, self.action_space).max_delay
+        own, given = self.policy.max_delay, check_spaces(env.observation_space, env.action_space).max_delay
         if own != given:
             raise ValueError(
                 f"This {type(self).__name__} was built for max_delay={own}, but this environment has max_delay={given};"

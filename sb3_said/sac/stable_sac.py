@@ -12,6 +12,7 @@ from stable_baselines3.common.utils import polyak_update
 
 from sb3_said.delays.space import UNDELAYED
 from sb3_said.sac.delayed_sac import DelayedSAC
+from sb3_said.sac.episodes import TrainingEpisodes
 from sb3_said.sac.policies import DelayedSACPolicy
 
 REFIT_GROWTH = 1.1  # the states are looked at again when there are a tenth more of them
@@ -104,12 +105,13 @@ class StableSAC(DelayedSAC):
         }
 
     def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:
-        """Let an agent of a file from before they were counted know nothing of its training episodes."""
+        """Let the actor of one that has no average be its average, and one whose training episodes lack know none."""
         params = super()._adapt_parameters(params)
         given = params.get("policy", {})
-        if any(name.startswith("averaged_actor.") for name in given):
-            unknown = {name: x for name, x in self.policy.state_dict().items() if name.startswith("training_episodes.")}
-            params = {**params, "policy": {**unknown, **given}}
+        if self.policy.averaged_actor is not None and any(name.startswith("actor.") for name in given):
+            own = {f"averaged_{name}": x for name, x in given.items() if name.startswith("actor.")}
+            unknown = {f"training_episodes.{name}": x for name, x in TrainingEpisodes().state_dict().items()}
+            params = {**params, "policy": {**own, **unknown, **given}}
         return params
 
     def _setup_learn(

@@ -9,6 +9,7 @@ from typing import Any
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_said.planner.checks import check_intervals
+from sb3_said.said.learning import PlannerLearner
 from sb3_said.said.trial import MakeEnv
 
 
@@ -25,11 +26,11 @@ class PlannerTrainingCallback(BaseCallback):
     :param make_trial_env: as of :meth:`~sb3_said.said.SAID.train_planner`
     :param intervals: in updates, ``log_interval``, ``eval_interval`` or ``save_interval`` of
         :meth:`~sb3_said.said.SAID.train_planner`
-    :raises TypeError: for another name
+    :raises TypeError: for another name, and where learning begins, for another algorithm
     :raises ValueError: for an interval below 1
     """
 
-    model: Any  # SAID, whose module imports this one
+    model: PlannerLearner
 
     def __init__(
         self,
@@ -46,6 +47,12 @@ class PlannerTrainingCallback(BaseCallback):
         check_intervals(**intervals)  # and not when the planner is trained, after all of learn()'s steps
         how = {"progress_bar": progress_bar, "should_stop": should_stop, "make_trial_env": make_trial_env}
         self.how: dict[str, Any] = {"folder": folder, **how, **intervals}
+
+    def _init_callback(self) -> None:
+        if not isinstance(self.model, PlannerLearner):
+            raise TypeError(
+                f"PlannerTrainingCallback trains SAID's planner, got {type(self.model).__name__}: leave it out."
+            )
 
     def _on_training_start(self) -> None:
         if self.model.num_timesteps < self.model._planner_trained_at:  # counting began anew

@@ -186,7 +186,8 @@ class PlannerLearner(OfflineAlgorithm):
         No environment is stepped and no expert is trained; the planner serves every delay 0..D. Callbacks are called
         after each update, and meet a planner that is at most 100 updates old, after the last one as it is.
         ``num_timesteps`` counts updates. From the first on the planner answers, by plans, and in the default way where
-        a trial had chosen another: none is played on logs.
+        a trial had chosen another: none is played on logs. V(s) scores candidates from then on (``value="iql"``), also
+        where ``learn`` goes on.
 
         :param dataset: whatever :func:`~sb3_said.offline.load_dataset` reads; None for what ``take_dataset`` took
         :param gradient_steps: ``planner_gradient_steps`` by default

@@ -130,7 +130,7 @@ def players_of(
     configs = {name: way for name, way in _configs(model).items() if way.mask in by_mask}
     if model.policy.max_delay == 0:
         guessing = [way for way in configs.values() if way.decided_by == "plan" and way.present == "guessed"]
-        twins = [replace(way, present="inpainted") for way in guessing]
+        twins = [replace(way, present="inpainted") for way in guessing if way.mask != "none"]
         configs = {name: way for name, way in configs.items() if way not in twins}
     return {name: (by_mask[way.mask], way) for name, way in configs.items()}
 

@@ -158,6 +158,7 @@ def largest_delay(delay: Delay) -> int:
     return 0 if delay is None else make_process(delay).max_delay
 
 
-def is_always(delay: Delay, age: int) -> bool:
-    """Say whether all observations amid an episode have this age."""
-    return age_range(0 if delay is None else delay) == (age, age)
+def ages_under(delay: Delay) -> list[int]:
+    """Return the ages that a delay can bring amid an episode, [0] without one."""
+    low, high = age_range(0 if delay is None else delay)
+    return [*range(low, high + 1)]

@@ -36,6 +36,7 @@ examples:
 The returns must be of this very file: one that was measured before the file was written anew is refused.
 """
 
+CARD_BEGINS = b"---\n"  # as the YAML of every card on the Hub
 TEMPLATE = """\
 ---
 {{ card_data }}
@@ -60,6 +61,8 @@ def main(argv: list[str] | None = None) -> None:
     target = args.output or args.agent.with_suffix(".md")
     with explained(parser):
         check_writable(target)
+        if target.is_file() and not target.read_bytes().startswith(CARD_BEGINS):
+            raise ValueError(f"{target} is no model card, and would be replaced: give another --output.")
         record, results = Record.read(args.run), Results(args.returns, None)
         run = load_run(args.agent, record.algo, record.env, gym_packages=record.gym_packages)
         card = make_card(run, record, results, args.latency, trial_steps(args.run))

@@ -25,6 +25,7 @@ from stable_baselines3.common.logger import Logger, make_output_format
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecNormalize
 
 from sb3_said import SAID, DelayedSAC, PlannerTrainingCallback, StableSAC
+from sb3_said.delays.space import ages_of
 from sb3_said.files.archive import SavedFileError
 from sb3_said.files.arguments import with_given
 from sb3_said.files.atomic import write_json, write_text
@@ -34,7 +35,7 @@ from sb3_said.offline import BC, DQL, OfflineAlgorithm
 from sb3_said.offline.datasets import is_file
 from sb3_said.planner.config import SAMPLING_SETTINGS
 from sb3_said.zoo.answer import BEST_NAME, EXPERT_FOLDER, evaluate_answer, save_with_normalization
-from sb3_said.zoo.arguments import Delay, ending_training, largest_delay, reading_settings
+from sb3_said.zoo.arguments import Delay, ages_under, ending_training, largest_delay, reading_settings
 from sb3_said.zoo.folder import (
     claim_folder,
     drop_undone_episodes,
@@ -190,6 +191,8 @@ class DelayedExperimentManager(ExperimentManager):
             for name in EVALUATED:
                 if isinstance(text := saved.get(name), str):
                     saved[name], hyperparams[name] = (eval(text, vars(exp_manager)) for _ in range(2))
+        for settings in (hyperparams, saved):
+            settings |= {name: number_of(value) for name, value in settings.items()}
         self._own_wrappers = saved.pop("env_wrapper", None)
         wrappers = with_delay(self._own_wrappers, self.run.delay, self.run.expert_delay)
         if wrappers:
@@ -247,7 +250,12 @@ class DelayedExperimentManager(ExperimentManager):
     def _set_up(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         if self.tensorboard_log:
             Path(self.tensorboard_log).mkdir(parents=True, exist_ok=True)
-        return super().setup_experiment()
+        made = super().setup_experiment()
+        if made is not None and isinstance(made[0], SAID):
+            delay = self.run.delay  # which the environments of an expert with its own do not have
+            ages = ages_of(made[0].env) if delay is None else ages_under(delay)
+            made[0].policy.planner.check_ages(ages)
+        return made
 
     def create_envs(self, *args: Any, **kwargs: Any) -> VecEnv:
         """Make environments of the expert's delay, in training as in the evaluations beside it.
@@ -489,6 +497,15 @@ def _decide_as_given(model: SAID, given: dict[str, Any]) -> None:
     if given.get("mask", own) != own:
         raise ValueError(f"--resume goes on with mask={own!r}, as its planner was trained, got {given['mask']!r}.")
     model.set_planner(**{name: value for name, value in given.items() if name in SAMPLING_SETTINGS})
+
+
+def number_of(setting: Any) -> Any:
+    """Return the number that a text is, for which YAML takes ``1e-3``; anything else as it is."""
+    try:
+        number = float(setting) if isinstance(setting, str) else None
+    except ValueError:
+        return setting
+    return setting if number is None else int(number) if number.is_integer() else number
 
 
 def has_its_planner(model: SAID) -> bool:

@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 from sb3_said.planner import PlannerConfig
-from sb3_said.zoo.arguments import Delay, is_always, largest_delay
+from sb3_said.zoo.arguments import Delay, ages_under, largest_delay
 
 PRESETS = ("cpu", "paper", "smoke", "quick")
 
@@ -76,6 +76,6 @@ def preset_overrides(
     if planner.pop("base", None) == "paper":
         planner = {**PlannerConfig.paper().to_dict(), **planner}
     planner |= by_delay.get(largest_delay(delay), {})
-    if not is_always(delay, largest_delay(delay) if max_delay is None else max_delay):
+    if ages_under(delay) != [largest_delay(delay) if max_delay is None else max_delay]:
         planner |= by_delay.get("varies", {})
     return {**overrides, "planner_kwargs": planner} if planner else overrides

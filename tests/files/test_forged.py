@@ -14,7 +14,7 @@ from saving import forge, make_policy, make_sac, same
 from stable_baselines3 import SAC
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_said import DelayedSAC
+from sb3_said import SAID, DelayedSAC, StableSAC
 from sb3_said.files.archive import SavedFileError, load_metadata, load_tree
 from sb3_said.sac.policies import DelayedSACPolicy
 
@@ -198,6 +198,13 @@ def test_pickles_and_files_of_sb3_are_refused_and_not_run(tmp_path):
     other.policy.load_state_dict(trusted.policy.state_dict())
     assert same(ours.get_parameters(), trusted.get_parameters())
     assert same(dict(other.policy.state_dict()), dict(trusted.policy.state_dict()))
+    obs = np.random.default_rng(0).normal(size=(9, 3)).astype(np.float32)
+    for cls in (StableSAC, SAID):
+        steadier = make_sac(cls=cls, seed=7, normalise_states=False, scale_rewards=False)
+        steadier.set_parameters(trusted.get_parameters(), exact_match=False)
+        np.testing.assert_allclose(
+            *(model.predict(obs, deterministic=True)[0] for model in (steadier, trusted)), rtol=1e-4, atol=1e-5
+        )
 
 
 @pytest.mark.parametrize("task", ["module:Task-v0", {"a": 1}, 3])

@@ -96,11 +96,14 @@ def test_a_planner_that_has_learned_nothing_decides_as_its_guess(trainer: Planne
 @th.no_grad()
 def test_it_learns_from_steps_of_the_episode_and_of_the_age_s_window_alone(monkeypatch: pytest.MonkeyPatch):
     planner, windows, fitted = make_planner(first_guess="prior"), make_windows(30), []
-    monkeypatch.setattr(planner.prior, "fit", lambda d, guess, clean, valid: fitted.append((d, valid)))
+    monkeypatch.setattr(planner.prior, "fit", lambda d, guess, clean, valid: fitted.append((d, guess, valid)))
     planner.fit_prior(windows)
-    assert [d for d, _ in fitted] == list(range(DELAY + 1))
-    for d, valid in fitted:
+    assert [d for d, *_ in fitted] == list(range(DELAY + 1))
+    z, known = planner.normalizer.normalize_states(windows.states), th.arange(LENGTH).expand(30, -1) == 0
+    for d, guess, valid in fitted:
         assert th.equal(valid, windows.valid & (th.arange(LENGTH) < d + planner.config.horizon))
+        own = planner.first_guess(z, windows.actions, th.full((30,), d), known, longest=d)
+        th.testing.assert_close(guess, planner._in_units(own))
 
 
 @th.no_grad()

@@ -269,3 +269,14 @@ def test_a_replay_may_have_the_agent_s_name(tmp_path):
     loaded = DelayedSAC.load(tmp_path / "agent", env=delayed(), device="cpu")
     loaded.load_replay_buffer(tmp_path / "agent")
     assert loaded.replay_buffer.size() == 30
+
+
+@pytest.mark.parametrize(("name", "given"), [("gamma", "0.9"), ("batch_size", 64.5), ("buffer_size", None)])
+def test_a_setting_of_another_type_is_refused_by_its_name(name, given):
+    with pytest.raises(ValueError, match=f"{name} is {given!r}, which is not of the type that DelayedSAC declares"):
+        make(cls=DelayedSAC, **{name: given})
+
+
+def test_a_count_may_be_written_as_a_float():
+    model = make(cls=DelayedSAC, buffer_size=1e2, batch_size=16.0)
+    assert (model.buffer_size, model.batch_size) == (100, 16) and isinstance(model.buffer_size, int)

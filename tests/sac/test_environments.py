@@ -112,6 +112,10 @@ class DictTask(gym.ObservationWrapper):
         return {"vec": observation}
 
 
+class TwoActions(Drift):
+    action_space = spaces.Box(-2.0, 2.0, (2,), np.float32)
+
+
 ABOVE = "go below DelayedObservationWrapper"
 
 
@@ -124,6 +128,7 @@ UNFIT = {
     "another max_delay": (lambda: delayed(3), "built for max_delay=2, but this environment has max_delay=3"),
     "a history of states": (lambda: DelayedObservationWrapper(Drift(), 2, state_history=True), "do not match"),
     "a task of another size": (lambda: DelayedObservationWrapper(gym.make("Pendulum-v1"), 2), "do not match"),
+    "a task of more actions": (lambda: DelayedObservationWrapper(TwoActions(), 2), "spaces do not match"),
 }
 
 

@@ -484,6 +484,22 @@ def test_policies_are_sent_to_other_processes_as_sb3s_are(cls):
     np.testing.assert_array_equal(*(each.predict(obs, deterministic=True)[0] for each in (policy, model.policy)))
 
 
+@pytest.mark.parametrize("cls", [DelayedSAC, StableSAC])
+def test_the_actor_of_an_agent_without_average_answers_for_one_that_has_it(cls, tmp_path):
+    """Until the average moves; what was learned before is of another actor."""
+    scales = {} if cls is DelayedSAC else {"actor_averaging": 0.0}
+    given, model = make_agent(cls=cls, **scales).learn(40), make_agent(cls=StableSAC).learn(60)
+    for source in (given.get_parameters(), tmp_path / "given.zip"):
+        given.save(tmp_path / "given.zip")
+        model.set_parameters(source, exact_match=False)
+        th.testing.assert_close(model.policy.averaged_actor.state_dict(), model.actor.state_dict())
+        own = {name: x for name, x in model.actor.state_dict().items() if name in given.actor.state_dict()}
+        th.testing.assert_close(own, {name: given.actor.state_dict()[name] for name in own})
+        assert model.policy.training_episodes.count == 0
+    if cls is StableSAC:
+        assert StableSAC.load(tmp_path / "given.zip", actor_averaging=0.9).actor_averaging == 0.9
+
+
 @pytest.mark.parametrize(
     ("name", "saved", "asked"),
     [("actor_averaging", 0.9998, 0.0), ("scale_rewards", True, False), ("critic_layer_norm", False, True)],

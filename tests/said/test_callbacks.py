@@ -12,7 +12,7 @@ from kill import Kill, Killed
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, CheckpointCallback
 from stable_baselines3.common.logger import DISABLED, KVWriter, Logger
 
-from sb3_said import SAID, DelayedObservationWrapper, PlannerTrainingCallback
+from sb3_said import SAID, DelayedObservationWrapper, PlannerTrainingCallback, StableSAC
 from sb3_said.files import checkpoint
 from sb3_said.files.archive import SavedFileError, load_tree, save_tree
 from sb3_said.files.checkpoint import TrainingCheckpointCallback, restore_training
@@ -477,6 +477,11 @@ def test_unknown_intervals_are_refused_before_the_training():
     for wrong in ({"trial_episodes": -1}, {"trial_episodes": 0.5}, {"eval_interval": 0}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             model.train_planner(**wrong)
+
+
+def test_an_agent_without_planner_is_refused_by_name():
+    with pytest.raises(TypeError, match=r"PlannerTrainingCallback trains SAID's planner, got StableSAC: leave it out"):
+        StableSAC("MlpPolicy", "Pendulum-v1", buffer_size=9, device="cpu").learn(2, PlannerTrainingCallback())
 
 
 def test_without_an_interval_there_is_one_row_at_the_end_as_with_one_of_all_updates():

@@ -77,3 +77,10 @@ def test_a_decision_of_one_s_own_is_kept_in_a_file_and_tried_against_all_ways(se
     assert loaded.planner_ways == {name: {"mask": "random", "present": "guessed", **way} for name, way in ways.items()}
     model.train_planner(trial_episodes=1)
     assert set(trial.play_trial(model, 1).returns) >= {"planner", "expert"}
+
+
+def test_a_planner_that_knows_nothing_but_presents_is_tried_without_delay():
+    """None of its ways has a twin that inpaints the present, which it cannot."""
+    ways = {"own": {"sampling_steps": 1}}
+    model = make(pendulum(delay=0), planner_kwargs={"mask": "none"}, planner_ways=ways).learn(60)
+    assert {*trial.play_trial(model, 1).returns} == {"planner", "own", "expert"}

@@ -6,7 +6,7 @@ import argparse
 
 import pytest
 
-from sb3_said.zoo.arguments import Delay, device, is_always, largest_delay, read_delay
+from sb3_said.zoo.arguments import Delay, ages_under, device, largest_delay, read_delay
 
 
 @pytest.mark.parametrize(
@@ -40,10 +40,11 @@ def test_a_bad_delay_is_refused(words: list[str], message: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("delay", "largest", "always"), [(None, 0, True), (4, 4, True), ("FixedDelay(4)", 4, True), ([0, 4], 4, False)]
+    ("delay", "ages"),
+    [(None, [0]), (4, [4]), ("FixedDelay(4)", [4]), ([0, 2], [0, 1, 2]), ("UniformDelay(2, 3)", [2, 3])],
 )
-def test_a_delay_has_a_largest_age_and_may_vary(delay: Delay, largest: int, always: bool) -> None:
-    assert (largest_delay(delay), is_always(delay, largest)) == (largest, always)
+def test_a_delay_has_a_largest_age_and_may_vary(delay: Delay, ages: list[int]) -> None:
+    assert (largest_delay(delay), ages_under(delay)) == (ages[-1], ages)
 
 
 def test_a_device_that_torch_has_not_here_is_refused_at_once() -> None:

@@ -71,6 +71,17 @@ def test_returns_of_another_file_are_refused(run: Path, tmp_path: Path, capsys: 
     assert f"{told} --episodes 2 --seed 10000 --json {returns} first" in capsys.readouterr().err
 
 
+def test_a_file_of_something_else_is_no_card_to_replace(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    notes, returns = tmp_path / "notes.md", tmp_path / "returns.json"
+    notes.write_text("# What I noticed\n\n---\n")
+    with pytest.raises(SystemExit):
+        card.main([str(run / "x.zip"), "--run", str(run), "--returns", str(returns), "-o", str(notes)])
+    assert f"{notes} is no model card, and would be replaced: give another --output" in capsys.readouterr().err
+    assert notes.read_text().startswith("# What I noticed")
+
+
 def test_returns_of_another_answer_alone_are_no_others(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -23,7 +23,7 @@ from kill import Killed
 from stable_baselines3.common.callbacks import EvalCallback
 from trained_run import NETWORKS, train_here
 
-from sb3_said import SAID, DelayedSAC
+from sb3_said import SAID, DelayedSAC, StableSAC
 from sb3_said.delays.space import ages_of
 from sb3_said.files import checkpoint
 from sb3_said.files.archive import load_tree
@@ -460,6 +460,16 @@ def test_says_what_is_wrong(words: str, message: str, tmp_path: Path, capsys: py
         ("-params batch_size:0", "batch_size is 0"),
         ("-params train_freq:0", "train_freq is 0"),
         ("-params n_envs:0", "n_envs must be at least 1, got 0"),
+        ("-params gamma:'high'", "gamma is 'high', which is not of the type that SAID declares"),
+        ("-params batch_size:64.5", "batch_size is 64.5, which is not of the type"),
+        (
+            "--delay 0 2 -params planner_kwargs:{'mask':'fixed'}",
+            "plans at age 2 only, got 0, 1, 2; train one with mask",
+        ),
+        (
+            "--delay 0 2 --expert-delay 2 -params planner_kwargs:{'mask':'fixed'}",
+            "plans at age 2 only, got 0, 1, 2; train one with mask",
+        ),
         ("-params env_wrapper:'gymnasium.wrappers.NormalizeObservation'", "statistics that no file holds"),
         ("-params frame_stack:2", "frame_stack wraps all environments at once, and no command could play the agent"),
         ("-tb /dev/null/x", "/dev/null"),
@@ -485,6 +495,18 @@ def test_a_file_without_steps_needs_them_on_the_command_line(tmp_path: Path) -> 
         train.main(words)
     train.main([*words, "-n", "60", "--seed", "1", "--verbose", "0"])
     assert DelayedSAC.load(tmp_path / "sadr" / "Pendulum-v1-seed1_1" / "Pendulum-v1").num_timesteps == 60
+
+
+def test_numbers_are_read_as_they_are_written(tmp_path: Path) -> None:
+    """YAML takes 1e-3 for text, and Python 1e3 for a float."""
+    block = "{policy: MlpPolicy, n_timesteps: 2e1, learning_rate: 1e-3, gamma: 9e-1, buffer_size: 1e3, n_envs: 2e0}"
+    (tmp_path / "own.yml").write_text(f"Pendulum-v1: {block}")
+    words = f"--algo stable --env Pendulum-v1 --seed 1 -conf {tmp_path}/own.yml --verbose 0 -params batch_size:1e1"
+    train_here(tmp_path, words)
+    model = StableSAC.load(tmp_path / "stable" / "Pendulum-v1-seed1_1" / "Pendulum-v1", device="cpu")
+    assert (model.num_timesteps, model.lr_schedule(1.0), model.gamma) == (20, 1e-3, 0.9)
+    assert (model.buffer_size, model.n_envs, model.batch_size) == (1000, 2, 10)
+    assert isinstance(model.batch_size, int)
 
 
 def test_a_search_of_rl_zoo3_leaves_no_folder_of_a_run(tmp_path: Path) -> None:

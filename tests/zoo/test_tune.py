@@ -274,10 +274,14 @@ def test_folders_that_cannot_be_tuned(run: Path, tmp_path: Path, capsys: pytest.
         with pytest.raises(SystemExit):
             tune.main([str(folder), "--device", "cpu"])
         assert message in capsys.readouterr().err
-    (run / CHECKPOINT_NAME).unlink()
-    with pytest.raises(SystemExit):
-        tune.main([str(run), "--device", "cpu"])
-    assert "has no checkpoint.zip" in capsys.readouterr().err
+    found = run / "tune"
+    found.mkdir()
+    write_best(run, found, {}, 5, "chosen")
+    for folder, message in ((run, "has no checkpoint.zip"), (found, f"what sb3-said tune found: give {run}")):
+        (run / CHECKPOINT_NAME).unlink(missing_ok=True)
+        with pytest.raises(SystemExit):
+            tune.main([str(folder), "--device", "cpu"])
+        assert message in capsys.readouterr().err
 
 
 def test_the_folder_of_a_run_is_no_output(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
