@@ -268,7 +268,7 @@ class DelayedExperimentManager(ExperimentManager):
                 with_delay(self._own_wrappers, *(delays if self._of_expert else delays[::-1]))
             )
         if self.vec_env_class is SubprocVecEnv:
-            shield()
+            shield()  # the training needs its environments to its end
         env = super().create_envs(*args, **kwargs)
         if not self._has_told and "action_history" not in getattr(env.observation_space, "spaces", {}):
             self._has_told = True  # a task may be registered with its delay, so its wrappers do not say

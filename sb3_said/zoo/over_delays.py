@@ -30,6 +30,7 @@ from sb3_said.files.atomic import check_writable
 from sb3_said.zoo.arguments import TRUST, add_playing, check_positive, explained, make_parser, read_delay
 from sb3_said.zoo.cells import AGE, Cell, Results, make_table, print_manners, print_scores, print_seeds, print_table
 from sb3_said.zoo.runs import ANSWERS, LoadedRun, answers, delay_name, load_run, longest_delay, origin
+from sb3_said.zoo.stopping import holding_back_ctrl_c, shield
 
 EPILOG = f"""\
 examples:
@@ -342,7 +343,9 @@ def play_all(cells: list[Cell], env_id: str, args: argparse.Namespace) -> Genera
         context.set_forkserver_preload([__name__])  # so that workers import it once
     pool = ProcessPoolExecutor(args.workers, context, initializer=begin_worker, initargs=(args.num_threads,))
     try:
-        futures = {pool.submit(play, cell, *how): cell for cell in cells}
+        shield()
+        with holding_back_ctrl_c():  # a worker whose start it breaks off tells so in a traceback
+            futures = {pool.submit(play, cell, *how): cell for cell in cells}
         yield from ((futures[future], future.result()) for future in as_completed(futures))
     except BrokenProcessPool as error:
         raise OSError(

@@ -60,8 +60,24 @@ class Stopping:
         )
 
 
+@contextmanager
+def holding_back_ctrl_c() -> Iterator[None]:
+    """Let Ctrl-C wait until the end of the context, in the main thread; no other is interrupted."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    held: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: held.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+        if held:
+            signal.raise_signal(signal.SIGINT)
+
+
 def shield() -> None:
-    """Let environments' processes ignore Ctrl-C: a terminal sends it to all, and the training needs them to its end.
+    """Let processes ignore Ctrl-C from their first step: a terminal sends it to all, also to those that are needed.
 
     They are forked from a server, and ignore what it has ignored since it began. Where there is none, as on Windows,
     Ctrl-C ends them, too.

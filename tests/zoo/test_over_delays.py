@@ -370,11 +370,16 @@ def test_workers_end_with_a_killed_command() -> None:
     assert killed.returncode == -signal.SIGKILL
 
 
-def test_ctrl_c_ends_workers_amid_their_cells(said: Path, tmp_path: Path) -> None:
-    """A terminal sends it to all: workers would go on with the next cells, and the command wait for them."""
+@pytest.mark.parametrize("starts", [False, True])
+def test_ctrl_c_ends_workers_amid_their_cells(starts: bool, said: Path, tmp_path: Path) -> None:
+    """A terminal sends it to all: workers would go on with the next cells, and the command wait for them.
+
+    Amid the start of one, too, which without what it is to do would tell so in a traceback.
+    """
     words = ["--delays", "0", "1", "--workers", "2", "--device", "cpu", "--json", str(tmp_path / "out.json")]
     code = f"""
-import time
+import os, time
+from multiprocessing import forkserver
 from signal import SIGINT, default_int_handler, signal
 from sb3_said.zoo import over_delays
 
@@ -382,9 +387,15 @@ def begin(*_):
     print("begun", flush=True)
     time.sleep(1000)
 
+def start(fds, start=forkserver.connect_to_new_process):
+    made = start(fds)
+    if {starts}:
+        os.kill(os.getpid(), SIGINT)
+    return made
+
 if __name__ == "__main__":
     signal(SIGINT, default_int_handler)  # which a background job of a shell ignores
-    over_delays.play = begin
+    over_delays.play, forkserver.connect_to_new_process = begin, start
     over_delays.main({[f"x={said}", *words]!r})
 """
     (script := tmp_path / "command.py").write_text(code)
@@ -392,9 +403,10 @@ if __name__ == "__main__":
     with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, start_new_session=True) as process:
         assert process.stdout is not None
         try:
-            while (line := process.stdout.readline()) != "begun\n":
+            while not starts and (line := process.stdout.readline()) != "begun\n":
                 assert line, "it has ended"
-            os.killpg(process.pid, signal.SIGINT)
+            if not starts:
+                os.killpg(process.pid, signal.SIGINT)
             printed, told = process.communicate(timeout=120)
         finally:
             with suppress(ProcessLookupError):

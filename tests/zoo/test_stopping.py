@@ -27,7 +27,7 @@ from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.sac import StableSAC
 from sb3_said.zoo import manager, train
 from sb3_said.zoo.runs import load_run
-from sb3_said.zoo.stopping import SIGNALS, Stopping
+from sb3_said.zoo.stopping import SIGNALS, Stopping, holding_back_ctrl_c
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "train.py"
 COMMAND = f"--algo said --env {ENV} --delay 2 --seed 3 --num-threads 1 --eval-freq -1 --device cpu --verbose 0"
@@ -169,6 +169,19 @@ def test_an_ignored_signal_stays_ignored() -> None:
         assert not stopping.is_asked
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+def test_ctrl_c_that_is_held_back_comes_once_what_it_would_break_off_is_done() -> None:
+    done, before = False, signal.signal(signal.SIGINT, signal.default_int_handler)  # which a background job ignores
+    try:
+        with pytest.raises(KeyboardInterrupt), holding_back_ctrl_c():
+            signal.raise_signal(signal.SIGINT)
+            done = True
+        assert done and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        with holding_back_ctrl_c():
+            pass
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_a_run_is_not_resumed_while_it_is_trained(
