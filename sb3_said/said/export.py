@@ -8,23 +8,27 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from sb3_said.delays.space import KEYS, check_spaces
 from sb3_said.files.atomic import replacing
+from sb3_said.files.normalization import get_statistics
 from sb3_said.said.said import SAID
 
 OPSET, IR_VERSION = 17, 8  # of 2022, so that old runtimes read it
 
 
-def to_onnx(model: SAID) -> Any:
+def to_onnx(model: SAID, normalization: VecNormalize | None = None) -> Any:
     """Return an agent's student as an ``onnx.ModelProto`` that answers as ``predict`` does.
 
     Its inputs are the keys of a delayed observation, float32: ``observation`` (B, obs_dim), ``action_history``
     (B, D, act_dim) and ``delay`` (B, 1); ``observation`` alone where the agent's task has no delay. Its output is
     ``action`` (B, act_dim), in the units of the action space. The metadata have ``max_delay``, the bounds of actions,
-    which the history is scaled by, and whether observations are those that ``VecNormalize`` has normalised.
+    which the history is scaled by, and whether observations are to be normalised before: an agent of ``VecNormalize``
+    has its scale in the graph, where that is known here.
 
+    :param normalization: what the agent's observations are normalised by; its environment's by default
     :raises ImportError: without the package onnx
     :raises ValueError: for an agent without a student
     """
@@ -55,14 +59,19 @@ def to_onnx(model: SAID) -> Any:
         nodes.append(helper.make_node(kind, list(inputs), [name], **attributes))
         return name
 
-    read = "observation"
+    read, scale = "observation", normalization or model.get_vec_normalize_env()
+    seen = get_statistics(scale).get("obs/observation")
+    if scale is not None and seen is not None:
+        mean, var, _ = seen
+        read = add("Div", [add("Sub", [read, constant(mean)]), constant(np.sqrt(var + scale.epsilon))])
+        read = add("Max", [add("Min", [read, constant(scale.clip_obs)]), constant(-scale.clip_obs)])
     if student.reader is not None:
         steps_ago = constant(np.arange(max_delay, 0, -1))  # (D,)
         since = add("Cast", [add("LessOrEqual", [steps_ago, "delay"])], to=TensorProto.FLOAT)  # (B, D)
         history = add("Mul", ["action_history", add("Unsqueeze", [since, constant([2], np.int64)])])
         flat = add("Flatten", [history], axis=1)  # also where D is 0, of which a Reshape could not tell B
         age = add("Div", ["delay", constant(max(max_delay, 1))])
-        read = add("Concat", ["observation", flat, age], axis=1)
+        read = add("Concat", [read, flat, age], axis=1)
     x = add("Div", [add("Sub", [read, constant(student.mean.cpu())]), constant(student.std.cpu())])
     for layer in student.network:
         if isinstance(layer, nn.Linear):
@@ -87,18 +96,19 @@ def to_onnx(model: SAID) -> Any:
     made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
     bounds = {"action_low": json.dumps(space.low.tolist()), "action_high": json.dumps(space.high.tolist())}
     bounds["action_dtype"] = str(space.dtype)
-    told = {"max_delay": str(max_delay), "reads_normalized": json.dumps(model.reads_normalized)}
+    told = {"max_delay": str(max_delay), "reads_normalized": json.dumps(model.reads_normalized and seen is None)}
     helper.set_model_props(made, told | bounds)
     onnx.checker.check_model(made)
     return made
 
 
-def export(model: SAID, path: str | os.PathLike[str]) -> None:
+def export(model: SAID, path: str | os.PathLike[str], normalization: VecNormalize | None = None) -> None:
     """Write :func:`to_onnx`'s graph to a file.
 
+    :param normalization: as there
     :raises ImportError: without the package onnx
     :raises ValueError: for an agent without a student
     """
-    made = to_onnx(model)
+    made = to_onnx(model, normalization)
     with replacing(path) as file:
         file.write(made.SerializeToString())

@@ -192,7 +192,7 @@ def _open_storage(storage: str) -> BaseStorage:
         lock = JournalFileOpenLock(storage)  # the default one is a symbolic link, which Windows lets few users make
         lock.acquire()
         try:
-            _cut_unfinished_line(Path(storage))
+            _mend_journal(Path(storage))
         finally:
             lock.release()
         return JournalStorage(JournalFileBackend(storage, lock))
@@ -204,7 +204,7 @@ def _open_storage(storage: str) -> BaseStorage:
         raise ValueError(f"--storage {storage} cannot be opened: {str(error).splitlines()[0]}") from error
 
 
-def _cut_unfinished_line(journal: Path) -> None:
+def _mend_journal(journal: Path) -> None:
     """Remove what a full disk or a power cut has left of a last line, which the next one would be joined to.
 
     :raises ValueError: for a file of something else

@@ -11,7 +11,7 @@ from small_task import Drift, delayed
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_said import DelayedObservationWrapper
+from sb3_said import SAID, DelayedObservationWrapper
 from sb3_said.realtime import ControlLoop, OnnxModel
 from sb3_said.said.export import export
 
@@ -66,11 +66,25 @@ def test_a_loop_of_it_sends_actions_of_the_agents_kind(dtype, tmp_path):
     np.testing.assert_allclose(own, wanted, rtol=1e-5)
 
 
-def test_it_tells_that_it_reads_normalised_observations(tmp_path):
-    model = teach(make(VecNormalize(DummyVecEnv([delayed]), norm_obs_keys=["observation"])))
+@pytest.mark.parametrize("make_env", [delayed, Drift])
+def test_it_has_the_scale_of_normalised_observations_where_that_is_known(make_env, tmp_path):
+    keys = ["observation"] if make_env is delayed else None
+    venv = VecNormalize(DummyVecEnv([make_env]), norm_obs_keys=keys, clip_obs=1.5)
+    model, obs = teach(make(venv)), observe()
+    obs = obs if make_env is delayed else obs["observation"]
+    seen = venv.obs_rms["observation"] if make_env is delayed else venv.obs_rms
+    seen.mean, seen.var = np.array([0.5, -0.3]), np.array([0.04, 2.0])
     export(model, tmp_path / "agent.onnx")
+    loaded, scaled = OnnxModel(tmp_path / "agent.onnx"), venv.normalize_obs(obs)
+    assert (np.abs(scaled["observation"] if make_env is delayed else scaled) == 1.5).any()
+    with model.policy.answering("student"):
+        wanted = model.predict(scaled, deterministic=True)[0]
+    np.testing.assert_allclose(loaded.predict(obs)[0], wanted, rtol=1e-5, atol=1e-6)
+    ControlLoop(loaded, 1)
+    model.save(tmp_path / "agent.zip")
+    export(SAID.load(tmp_path / "agent.zip", device="cpu"), tmp_path / "alone.onnx")
     with pytest.raises(ValueError, match=r"give normalize=venv\.normalize_obs"):
-        ControlLoop(OnnxModel(tmp_path / "agent.onnx"), 1)
+        ControlLoop(OnnxModel(tmp_path / "alone.onnx"), 1)
 
 
 def test_an_answer_that_is_not_finite_is_refused(tmp_path):
