@@ -366,8 +366,8 @@ class PlannerTrainer:
             bad = self.n_updates - 1  # its gradient, and no loss came after it
         if bad >= 0:
             raise FloatingPointError(
-                f"Update {bad} (of {self.gradient_steps}) of the planner was not finite; the planner stays as it was "
-                "before this training. Check the data for infinite values; else lower learning_rate "
+                f"Update {bad} (of {self.gradient_steps}) of the planner was not finite; the planner stays as it was. "
+                "Check the data for infinite values; else lower learning_rate "
                 f"({self.config.learning_rate}) or lengthen warmup_steps ({self.config.warmup_steps})."
             )
 

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_said.delays.observations import checked_observation
-from sb3_said.delays.space import delayed_space
+from sb3_said.delays.space import delayed_space, within_bounds
 
 
 class OnnxModel:
@@ -57,4 +57,5 @@ class OnnxModel:
         action: np.ndarray = self._session.run(["action"], given)[0]
         if not np.isfinite(action).all():
             raise ValueError(f"The graph answers {action}, which is not finite; look at the observation: {given}.")
+        action = within_bounds(action, self.action_space)
         return action if is_batch else action[0], None

@@ -11,7 +11,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
-from sb3_said.delays.space import KEYS, check_spaces
+from sb3_said.delays.space import KEYS, check_spaces, holds_whole_numbers
 from sb3_said.files.atomic import replacing
 from sb3_said.files.normalization import get_statistics
 from sb3_said.said.said import SAID
@@ -81,6 +81,7 @@ def to_onnx(model: SAID, normalization: VecNormalize | None = None) -> Any:
             x = add({nn.ReLU: "Relu", nn.Tanh: "Tanh"}[type(layer)], [x])
     low, high = (bound.astype(np.float32) for bound in (space.low, space.high))
     x = add("Add", [constant(low), add("Mul", [constant(0.5 * (high - low)), add("Add", [x, constant(1.0)])])])
+    x = add("Round", [x]) if holds_whole_numbers(space) else x
     x = add("Max", [add("Min", [x, constant(high)]), constant(low)])
     nodes.append(helper.make_node("Identity", [x], ["action"]))
 

@@ -186,8 +186,8 @@ class PlannerLearner(OfflineAlgorithm):
         No environment is stepped and no expert is trained; the planner serves every delay 0..D. Callbacks are called
         after each update, and meet a planner that is at most 100 updates old, after the last one as it is.
         ``num_timesteps`` counts updates. From the first on the planner answers, by plans, and in the default way where
-        a trial had chosen another: none is played on logs. V(s) scores candidates from then on (``value="iql"``), also
-        where ``learn`` goes on.
+        it decides in another of ``planner_ways``, as a trial chooses: none is played on logs. V(s) scores candidates
+        from then on (``value="iql"``), also where ``learn`` goes on.
 
         :param dataset: whatever :func:`~sb3_said.offline.load_dataset` reads; None for what ``take_dataset`` took
         :param gradient_steps: ``planner_gradient_steps`` by default
@@ -213,7 +213,7 @@ class PlannerLearner(OfflineAlgorithm):
             # An actor of the steps before would leave all that is learned here aside
             config = replace(self.policy.planner.config, decided_by="plan")
             if self.planner_ways and self._planner_trained_at > 0:
-                config = untried(config)
+                config = untried(config, self.planner_ways.values())
             is_another = config.mask != self.policy.planner.config.mask
             self.policy.take_planner(self.policy.new_planner(config) if is_another else self.policy.planner, config)
             self.value = "iql"
@@ -239,7 +239,7 @@ class PlannerLearner(OfflineAlgorithm):
         try:
             outcome = training.run(should_stop=should_stop, on_step=on_step)
         finally:
-            if trainer.n_updates == 0:
+            if not training.has_handed_over:
                 take_back()
         if outcome == "stopped":
             raise KeyboardInterrupt
@@ -311,9 +311,9 @@ class PlannerLearner(OfflineAlgorithm):
 
     @contextmanager
     def _as_before_if_it_fails(self) -> Iterator[Callable[[], None]]:
-        """Take back what a training from logs changes before its first update, if it gets no further.
+        """Take back what a training from logs changes before its planner is handed over, if it gets no further.
 
-        It gives the function that does, for a training that ends later, before its first update.
+        It gives the function that does, for a training that ends later, before that.
         """
         names = "replay_buffer", "num_timesteps", "value", "_planner_trained_at"
         before, policy = {name: getattr(self, name) for name in names}, self.policy

@@ -303,9 +303,9 @@ class SAID(PlannerLearner, StableSAC):
         :raises ValueError: as :meth:`InpaintingPlanner.check_ages`
         """
         who = self.policy.who_answers
-        if who != "expert":  # masks were drawn from all of 0..D, so it has met every age
-            self.policy.planner.check_ages(ages)
         acts_at = [age for age in ages if who == "expert" or (who == "both" and age in self.policy.expert_ages)]
+        if who != "expert":  # masks were drawn from all of 0..D, so it has met every age
+            self.policy.planner.check_ages([age for age in ages if age not in acts_at])
         if who in ("planner", "both") and self.policy.planner.config.decided_by == "actor":
             acts_at.append(0)  # on the present, as if it saw it
         return acts_at

@@ -61,6 +61,7 @@ class PlannerTraining:
         self.name = "planner" if self.is_agents else f"planner of mask={mask!r}"
         self._clock = None if folder is None else CheckpointClock(planner_checkpoint(Path(folder), mask))
         self.watcher = watcher
+        self.has_handed_over = False
         self._data = {"num_timesteps": model.num_timesteps, "replay": checksum(model)}
         self._weighed = {name: getattr(model, name) for name in ("gamma", "planner_terminal_penalty", "value")}
         self._value_losses: dict[str, th.Tensor] = {}  # of the last update; read at log times only
@@ -130,7 +131,8 @@ class PlannerTraining:
         :raises FloatingPointError: when an update was not finite; all stays as it was
         """
         self.trainer.hand_over()
-        if self.trainer.n_updates > 0 and self.is_agents:
+        self.has_handed_over = self.trainer.n_updates > 0
+        if self.has_handed_over and self.is_agents:
             self.model.policy.planner_updates.fill_(float(self.trainer.n_updates))
             self.model.policy.set_answer("planner")
             if self.value_trainer is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -92,10 +92,15 @@ def in_way(own: PlannerConfig, settings: dict[str, Any]) -> PlannerConfig:
         return replace(own, **{"decided_by": "plan", "present": PlannerConfig.present, **settings})
 
 
-def untried(config: PlannerConfig) -> PlannerConfig:
-    """Return a planner's settings as they are before a trial has chosen among ways."""
+def untried(config: PlannerConfig, ways: Collection[dict[str, Any]]) -> PlannerConfig:
+    """Return a planner's settings as they are before a trial has chosen among ways: the default's, where it has one's.
+
+    Settings that no way names stay, and all that are the user's own.
+    """
     mask = PlannerConfig.mask if config.mask == "own" else config.mask
-    return replace(config, **{name: getattr(PlannerConfig, name) for name in SAMPLING_SETTINGS}, mask=mask)
+    is_a_way = any(config == in_way(config, way) for way in ways)
+    named = set(SAMPLING_SETTINGS).intersection(*[set().union(*ways)]) if is_a_way else ()
+    return replace(config, **{name: getattr(PlannerConfig, name) for name in named}, mask=mask)
 
 
 def _configs(model: SAID) -> dict[str, PlannerConfig]:

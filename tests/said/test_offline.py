@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 import torch as th
-from small_agent import answer, make, observe
+from small_agent import PLANNER, answer, make, observe
 from small_task import delayed
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -18,6 +18,7 @@ from sb3_said.offline import IQL, Dataset, IQLConfig
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.said.policies import SAIDPolicy
 from sb3_said.said.training import PlannerTraining
+from sb3_said.said.ways import WAYS
 
 
 def log(n_episodes=6, length=12, seed=0):
@@ -406,6 +407,33 @@ def test_a_training_that_ends_before_its_first_update_leaves_a_trained_agent_as_
     assert model.replay_buffer is replay and model._planner_trained_at == 60
     th.testing.assert_close(weights(model), before, rtol=0, atol=0)
     np.testing.assert_array_equal(answer(model, obs), own)
+
+
+def test_a_training_that_diverges_at_once_leaves_a_trained_agent_as_it_was(tmp_path):
+    make().learn(60).save(tmp_path / "agent.zip")
+    wild = {**PLANNER, "learning_rate": 1e30, "warmup_steps": 0}
+    model = SAID.load(tmp_path / "agent.zip", env=delayed(), planner_kwargs=wild, device="cpu")
+    replay, before, own = model.replay_buffer, weights(model), answer(model, observe())
+    with pytest.raises(FloatingPointError, match="Update 0"):
+        model.learn_offline(log(), 150)
+    assert (model.value, model.policy.values, model.num_timesteps) == ("critics", None, 60)
+    assert model.replay_buffer is replay
+    th.testing.assert_close(weights(model), before, rtol=0, atol=0)
+    np.testing.assert_array_equal(answer(model, observe()), own)
+
+
+def test_a_decision_of_the_users_own_is_kept_and_one_of_a_trial_is_not():
+    model = make(delayed(delay=(0, 2)), planner_ways=WAYS).learn(60)
+    own = {"temperature": 0.7, "n_candidates": 5, "sampling_steps": 3}
+    model.set_planner(**own)
+    learn(model)
+    assert {name: getattr(model.policy.planner.config, name) for name in own} == own
+    model.set_planner(**WAYS["weighed"])  # as a trial takes it
+    model.train_planner()
+    learn(model)
+    config = model.policy.planner.config
+    assert (config.temperature, config.sampling_steps, config.choice_factor) == (0.0, 5, PlannerConfig.choice_factor)
+    assert config.n_candidates == 5
 
 
 def test_a_failed_training_changes_nothing(monkeypatch):

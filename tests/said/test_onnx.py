@@ -62,8 +62,14 @@ def test_a_loop_of_it_sends_actions_of_the_agents_kind(dtype, tmp_path):
         for loop in loops:
             loop.observe(np.ones(2), n_executed=0)
         own, wanted = (loop.act(0) for loop in loops)
+        answers = [each.predict(observe(), deterministic=True)[0] for each in (loaded, model)]
     assert own.dtype == wanted.dtype == dtype
     np.testing.assert_allclose(own, wanted, rtol=1e-5)
+    assert answers[0].dtype == answers[1].dtype == dtype
+    np.testing.assert_allclose(*answers, rtol=1e-5)
+    given = {key: part.astype(np.float32) for key, part in observe().items()}
+    session = loaded._session.run(["action"], given)[0]  # by who reads the file without us
+    np.testing.assert_allclose(session, answers[1], rtol=1e-5)
 
 
 @pytest.mark.parametrize("make_env", [delayed, Drift])

@@ -259,6 +259,19 @@ def test_a_warmup_changes_no_answer(saved):
         model.warmup(0)
 
 
+def test_a_planner_of_one_age_needs_to_know_those_that_the_expert_does_not_answer(tmp_path):
+    env = delayed(delay=(0, 2))
+    with pytest.warns(UserWarning, match="mask='fixed' plans at age 2 only"):
+        model = make(env, planner_kwargs={"mask": "fixed"}).learn(60)
+    model.set_answer("both", expert_up_to=1)
+    model.set_env(env)
+    model.save(tmp_path / "agent.zip")
+    assert SAID.load(tmp_path / "agent.zip", env=env, device="cpu").policy.who_answers == "both"
+    model.set_answer("both", expert_up_to=0)
+    with pytest.raises(ValueError, match="plans at age 2 only, got 1, 2"):
+        model.set_env(env)
+
+
 @pytest.mark.parametrize("planner_kwargs", [{}, {"mask": "fixed"}])
 def test_every_agent_can_be_warmed_up(planner_kwargs):
     for model in (make(planner_kwargs=planner_kwargs), make("Pendulum-v1", planner_kwargs=planner_kwargs)):
