@@ -11,12 +11,27 @@ import numpy as np
 from sb3_said.delays.processes import (
     BaseProcess,
     Delay,
+    DelayProcess,
     as_process,
     checked_count,
     checked_probability,
     packet_delays,
     smallest_age,
 )
+
+
+def _inner(delay: Delay) -> DelayProcess:
+    """Return a process that another one is made of.
+
+    :raises ValueError: for a :class:`TotalDelay` in which every action takes a time of its own
+    """
+    process = as_process(delay)
+    if isinstance(process, TotalDelay) and process.action_varies:
+        raise ValueError(
+            f"{process.action} draws a delay for every action, which the age of observations cannot express; give "
+            "TotalDelay to DelayedObservationWrapper as it is, not inside another process."
+        )
+    return process
 
 
 @dataclass(frozen=True)
@@ -26,7 +41,7 @@ class _OfProcess(BaseProcess):
     process: Delay
 
     def __post_init__(self) -> None:
-        process = as_process(self.process)
+        process = _inner(self.process)
         self._set(process=process, min_delay=smallest_age(process), max_delay=process.max_delay)
 
 
@@ -132,7 +147,7 @@ class TotalDelay(BaseProcess):
     action: Delay
 
     def __post_init__(self) -> None:
-        observation, action = as_process(self.observation), as_process(self.action)
+        observation, action = _inner(self.observation), _inner(self.action)
         low, high = smallest_age(observation) + smallest_age(action), observation.max_delay + action.max_delay
         self._set(observation=observation, action=action, min_delay=low, max_delay=high)
 
@@ -144,15 +159,12 @@ class TotalDelay(BaseProcess):
     def sample(self, rng: np.random.Generator) -> int | Iterator[int | None]:
         """Draw the observation delays from ``rng``, as they are without action delay, the action delay from a child.
 
+        Only where no action takes a time of its own, which the wrapper acts out.
+
         :return: one number for the episode where both are
-        :raises ValueError: for an action process that draws anew for every packet
         """
         added = packet_delays(self.action, rng.spawn(1)[0])
-        if not isinstance(added, itertools.repeat):
-            raise ValueError(
-                f"{self.action} draws a delay for every action, which the age of observations cannot express; give "
-                "TotalDelay to DelayedObservationWrapper as it is, not inside another process."
-            )
+        assert isinstance(added, itertools.repeat), self.action
         k, delays = next(added), packet_delays(self.observation, rng)
         if isinstance(delays, itertools.repeat):
             return next(delays) + k

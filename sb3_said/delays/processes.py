@@ -199,7 +199,8 @@ def in_steps(milliseconds: float | np.ndarray, control_period: float) -> int | n
 
     :param milliseconds: a delay, or an array of them, >= 0
     :param control_period: of one control step, in milliseconds, > 0
-    :raises ValueError: for negative or non-finite delays, or a control period that is not positive
+    :raises ValueError: for negative or non-finite delays, a control period that is not positive, and more steps than
+        any delay has
 
     >>> FixedDelay(in_steps(70, control_period=20))
     FixedDelay(delay=4)
@@ -209,7 +210,13 @@ def in_steps(milliseconds: float | np.ndarray, control_period: float) -> int | n
         raise ValueError(
             f"Delays are >= 0 ms and the control period is > 0 ms, got {milliseconds} and {control_period}."
         )
-    steps = np.ceil(np.round(delays / control_period, 9)).astype(np.int64)  # 0.3 / 0.1 is a bit above 3
+    steps = np.ceil(np.round(delays / control_period, 9))  # 0.3 / 0.1 is a bit above 3
+    if np.any(steps > LARGEST_DELAY):
+        raise ValueError(
+            f"Delays are at most {LARGEST_DELAY} control steps, got {milliseconds} ms with a control period of "
+            f"{control_period} ms."
+        )
+    steps = steps.astype(np.int64)
     return int(steps) if steps.ndim == 0 else steps
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import csv
 import hashlib
+import math
 import shlex
 from pathlib import Path
 from typing import Any
@@ -60,6 +61,8 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(argv)
     target = args.output or args.agent.with_suffix(".md")
     with explained(parser):
+        if args.latency is not None and not 0 < args.latency < math.inf:
+            raise ValueError(f"--latency is a time in milliseconds, above 0, got {args.latency}.")
         check_writable(target)
         if target.is_file() and not target.read_bytes().startswith(CARD_BEGINS):
             raise ValueError(f"{target} is no model card, and would be replaced: give another --output.")
@@ -94,6 +97,10 @@ def make_card(
     :param n_trial_steps: environment steps that told how the planner decides, beyond those of the training
     :raises ValueError: when the results hold nothing of this file, or are of another task than its training
     """
+    made = {"seed": (record.seed, run.model.seed), "env": (record.env, getattr(run.model, "task", None) or record.env)}
+    if others := {name: pair for name, pair in made.items() if pair[0] != pair[1]}:
+        told = ", ".join(f"{name}={own!r}, and the agent {name}={its!r}" for name, (own, its) in others.items())
+        raise ValueError(f"{run.info['file']} is not of the run that --run names, which has {told}: name its own.")
     if run.changes != (trained := changes(record.env_kwargs, record.wrappers)):
         raise ValueError(
             f"{run.info['file']} was trained in a task that its run changes by {trained}, and outside the run's folder "

@@ -8,6 +8,7 @@ from typing import Any
 
 from sb3_said import SAID
 from sb3_said.delays.space import written_ages
+from sb3_said.files.archive import SavedFileError, load_metadata
 from sb3_said.files.atomic import check_writable
 from sb3_said.files.normalization import normalization_file
 from sb3_said.planner.config import SAMPLING_SETTINGS
@@ -71,7 +72,7 @@ def main(argv: list[str] | None = None) -> None:
     )
     parser.add_argument("--compact", action="store_true", help="write weights as float16, and no optimizers")
     args = parser.parse_args(argv)
-    if args.output is not None and args.output.suffix != ".zip":
+    if args.output is not None and args.output.suffix != ".zip" and not args.output.is_dir():
         args.output = Path(f"{args.output}.zip")  # as SB3 names agents
     given = {name: getattr(args, name) for name in SAMPLING_SETTINGS if getattr(args, name) is not None}
     settings: dict[str, Any] = {name: None if value == "none" else value for name, value in given.items()}
@@ -90,7 +91,7 @@ def main(argv: list[str] | None = None) -> None:
         if sets_answer:
             let_answer(model, args.answer or model.policy.who_answers, *expert_ages)
         if args.output is not None:
-            check_writable(args.output)
+            check_target(args.output)
     config = model.policy.planner.config
     for name in SAMPLING_SETTINGS:
         print(f"{name:14} {getattr(config, name)}" + "  (new)" * (name in settings))
@@ -116,6 +117,21 @@ def let_answer(model: SAID, who: Answer, up_to: int | None, since: int | None) -
     if (who == "both") != (up_to is not None or since is not None):
         raise ValueError("--answer both and --expert-up-to or --expert-from need each other.")
     model.set_answer(who, up_to, since)
+
+
+def check_target(path: Path) -> None:
+    """Refuse a target that cannot be written, or holds something else than an agent, such as a run's checkpoint.
+
+    :raises ValueError: for it
+    """
+    check_writable(path)
+    if path.is_file():
+        try:
+            kind = load_metadata(path)["kind"]
+        except SavedFileError:
+            kind = None
+        if kind != SAID.__name__:
+            raise ValueError(f"{path} is no agent of SAID, and would be replaced: give another -o.")
 
 
 def hand_on(model: SAID, agent: Path, output: Path, compact: bool) -> None:

@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 
+from sb3_said.files.atomic import check_writable
 from sb3_said.sac import DelayedSAC
 from sb3_said.zoo.arguments import TRUST, add_run, check_positive, explained, make_parser, read_delay
 from sb3_said.zoo.runs import ANSWERS, LoadedRun, answering, load_run, longest_delay
@@ -157,7 +158,8 @@ def follow(env: gym.Env[Any, Any]) -> None:
 def check_can_record(path: Path) -> None:
     """Fail before an agent is loaded, with what to install.
 
-    :raises ValueError: for a file that is no video
+    :raises ValueError: for a file that is no video, and a folder
+    :raises OSError: where the file cannot be written
     :raises ImportError: without imageio, or when MuJoCo cannot load the library that MUJOCO_GL names
     """
     if path.suffix not in (".mp4", ".gif"):
@@ -168,6 +170,7 @@ def check_can_record(path: Path) -> None:
         import mujoco  # noqa: F401  # loads the GL library
     except Exception as error:
         raise CannotDraw(error) from error
+    check_writable(path)
 
 
 def main(argv: list[str] | None = None) -> None:

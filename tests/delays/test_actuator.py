@@ -158,9 +158,9 @@ def test_equal_delays_of_every_action_become_one_delay():
 
 
 def test_one_delay_for_each_action_is_refused_inside_another_process():
-    env = DelayedObservationWrapper(LoggedTask(), HeldDelay(TotalDelay(2, WIFI_20MS)))
-    env.reset()
     with pytest.raises(ValueError, match=r"draws a delay for every action, .* not inside another process"):
-        env.step(env.action_space.sample())
+        DelayedObservationWrapper(LoggedTask(), HeldDelay(TotalDelay(2, WIFI_20MS)))
+    with pytest.raises(ValueError, match=r"draws a delay for every action, .* not inside another process"):
+        DelayedObservationWrapper(LoggedTask(), TotalDelay(2, WIFI_20MS), action_delay=1)
     with pytest.raises(ValueError, match="delay"):
         DelayedObservationWrapper(LoggedTask(), 2, -1)

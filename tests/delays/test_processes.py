@@ -106,7 +106,9 @@ def test_milliseconds_of_periods_that_floats_cannot_hold():
     assert FixedDelay(in_steps(8, 2)) == FixedDelay(4)
 
 
-@pytest.mark.parametrize(("delay", "period"), [(-1, 20), (float("nan"), 20), (20, 0), (20, -5), (20, float("inf"))])
+@pytest.mark.parametrize(
+    ("delay", "period"), [(-1, 20), (float("nan"), 20), (20, 0), (20, -5), (20, float("inf")), (1e30, 1)]
+)
 def test_impossible_milliseconds_are_refused(delay, period):
     with pytest.raises(ValueError, match="control period"):
         in_steps(delay, period)

@@ -11,6 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -80,6 +81,30 @@ def test_a_file_of_something_else_is_no_card_to_replace(
         card.main([str(run / "x.zip"), "--run", str(run), "--returns", str(returns), "-o", str(notes)])
     assert f"{notes} is no model card, and would be replaced: give another --output" in capsys.readouterr().err
     assert notes.read_text().startswith("# What I noticed")
+
+
+def test_a_run_that_did_not_make_the_agent_is_refused(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    returns, file = tmp_path / "returns.json", run / f"{ENV}.zip"
+    over_delays.main([f"x={file}", "--delays", "0", "--episodes", "2", "--device", "cpu", "--json", str(returns)])
+    other = Path(shutil.copytree(run, tmp_path / "other"))
+    record = Record.read(run)
+    gym.register("SamePendulum-v0", "gymnasium.envs.mujoco.inverted_pendulum_v5:InvertedPendulumEnv")
+    wrong = {"seed=8, and the agent seed=0": {"seed": 8}, "env='SamePendulum-v0', and": {"env": "SamePendulum-v0"}}
+    for told, change in wrong.items():
+        replace(record, **change).write(other)
+        with pytest.raises(SystemExit):
+            card.main([str(file), "--run", str(other), "--returns", str(returns), "-o", str(tmp_path / "card.md")])
+        assert told in capsys.readouterr().err
+    assert not (tmp_path / "card.md").exists()
+
+
+@pytest.mark.parametrize("latency", ["nan", "-1", "inf"])
+def test_a_time_that_is_none_is_refused(latency: str, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        card.main([str(run), "--run", str(run), "--returns", "x.json", "--latency", latency, "-o", "x.md"])
+    assert "--latency is a time in milliseconds, above 0" in capsys.readouterr().err
 
 
 def test_returns_of_another_answer_alone_are_no_others(

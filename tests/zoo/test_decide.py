@@ -20,6 +20,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.evaluation import collect_observations
+from sb3_said.files.archive import save_tree
 from sb3_said.files.normalization import normalization_file, save_normalization
 from sb3_said.zoo import decide, evaluate
 from sb3_said.zoo.answer import EXPERT_FOLDER
@@ -122,6 +123,21 @@ def test_a_file_s_name_gets_its_suffix(run: Path, tmp_path: Path, capsys: pytest
     decide.main([str(run), "--temperature", "0.5", "-o", str(tmp_path / "hopper_t0.5")])
     assert f"Wrote {tmp_path / 'hopper_t0.5.zip'}" in capsys.readouterr().out
     assert SAID.load(tmp_path / "hopper_t0.5.zip", device="cpu").policy.planner.config.temperature == 0.5
+
+
+def test_what_is_no_agent_is_not_replaced(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "notes.zip").write_text("mine")
+    save_tree(tmp_path / "checkpoint.zip", {"replay": 1})
+    refused = "is no agent of SAID, and would be replaced"
+    for name, told in (("logs", "it is a folder"), ("notes.zip", refused), ("checkpoint.zip", refused)):
+        before = {file: file.read_bytes() for file in tmp_path.glob("*.zip")}
+        with pytest.raises(SystemExit) as stop:
+            decide.main([str(run), "--compact", "-o", str(tmp_path / name)])
+        assert stop.value.code == 2 and told in capsys.readouterr().err
+        assert {file: file.read_bytes() for file in tmp_path.glob("*.zip")} == before
+    decide.main([str(run), "--compact", "-o", str(tmp_path / "agent.zip")])
+    decide.main([str(run), "--temperature", "0.5", "-o", str(tmp_path / "agent.zip")])
 
 
 def test_without_settings_it_shows_them(run: Path, capsys: pytest.CaptureFixture[str]) -> None:

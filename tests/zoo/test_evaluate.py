@@ -318,6 +318,7 @@ def test_paths_that_hold_no_agent(run: Path, tmp_path: Path) -> None:
     [
         (["--record", "film.avi"], "ending in .mp4 or .gif"),
         (["--record", "film.gif", "--fps", "0"], "at least 1"),
+        (["--record", "{folder}"], "it is a folder"),
         (["--record", "film.gif", "--env", "Pendulum-v1", "--size", "64"], "Pendulum-v1 cannot be made with"),
         ([], "no display"),
     ],
@@ -328,12 +329,14 @@ def test_enjoy_says_what_is_wrong(
     message: str,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
 ) -> None:
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    (folder := tmp_path / "a_folder.mp4").mkdir()
     with pytest.raises(SystemExit) as exit_info:
-        enjoy.main([str(run), *arguments])
+        enjoy.main([str(run), *[word.format(folder=folder) for word in arguments]])
     assert exit_info.value.code == 2 and message in capsys.readouterr().err
 
 
