@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples, Repla
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_said.delays.space import EXECUTED, UNDELAYED, WRAPPER_ORDER, check_spaces
-from sb3_said.replay.checks import check_finite, check_order, true_states
+from sb3_said.replay.checks import OWN_ENVIRONMENT, check_finite, check_order, true_states
 from sb3_said.replay.stored import ROW_ARRAYS, check_stored
 from sb3_said.replay.windows import Windows, WindowSource
 
@@ -224,7 +224,7 @@ class DelayedReplayBuffer(ReplayBuffer):
             env = np.argmax(differs)
             raise ValueError(
                 f"The observation of environment {env} has age {ages[env]}, but is not the state of {ages[env]} steps "
-                f"before. {WRAPPER_ORDER}"
+                f"before. {OWN_ENVIRONMENT} {WRAPPER_ORDER}"
             )
 
     def reset(self) -> None:

@@ -8,6 +8,10 @@ import numpy as np
 
 from sb3_said.delays.space import UNDELAYED, WRAPPER_ORDER
 
+OWN_ENVIRONMENT = (
+    "If a callback or evaluate_policy steps the training environment during learn(), give it an environment of its own."
+)
+
 
 def check_finite(parts: dict[str, np.ndarray], n_envs: int) -> None:
     """Refuse NaN, and what is infinite in float32.
@@ -68,6 +72,5 @@ def check_order(
         raise ValueError(
             f"The observation after the action of environment {np.argwhere(differs)[0, 0]} does not follow the one "
             "before it: its action_history is not the same with one action more. Transitions must be added in the "
-            "order they happened, and each of them. If a callback or evaluate_policy steps the training environment "
-            f"during learn(), give it an environment of its own. {WRAPPER_ORDER}"
+            f"order they happened, and each of them. {OWN_ENVIRONMENT} {WRAPPER_ORDER}"
         )

@@ -152,6 +152,7 @@ class StableSAC(DelayedSAC):
         row = replay_buffer.pos - 1
         begins = replay_buffer.steps[row] == 0  # (n_envs,), as the replay saw it
         if self.policy.return_scale is not None:
+            reward = np.asarray(reward, np.float32)  # as a DummyVecEnv has them, and environments in processes do not
             self._running_returns = reward + self.gamma * np.where(begins, 0.0, self._running_returns)
             self.policy.return_scale.update(self._running_returns)
         if self.policy.training_episodes is not None:

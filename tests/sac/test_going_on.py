@@ -199,10 +199,11 @@ def test_learning_goes_on_under_monitors_that_refuse_resets(make_env):
         env.reset()
 
 
-def test_who_plays_the_environment_during_learning_is_told_what_to_do():
+@pytest.mark.parametrize("eval_freq", [20, 24])  # amid an episode, and at its end
+def test_who_plays_the_environment_during_learning_is_told_what_to_do(eval_freq):
     env = make_vec_env(lambda: delayed(4), n_envs=1)
     with pytest.raises(ValueError, match=r"evaluate_policy.*an environment of its own"):
-        make(env).learn(40, callback=EvalCallback(env, eval_freq=20, n_eval_episodes=1, warn=False, verbose=0))
+        make(env).learn(50, callback=EvalCallback(env, eval_freq=eval_freq, n_eval_episodes=1, warn=False, verbose=0))
 
 
 def test_a_replay_emptied_during_training_is_refused_with_what_to_do():

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from small_agent import make as make_agent
 from small_agent import observe
-from small_task import Drift, delayed
+from small_task import Drift, delayed, pendulum
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.running_mean_std import RunningMeanStd
@@ -473,6 +473,16 @@ def test_beside_vec_normalize():
 def test_settings_out_of_range(given, message):
     with pytest.raises(ValueError, match=message):
         make(**given)
+
+
+def test_environments_in_processes_teach_the_same_scale():
+    """They hand out rewards in float64."""
+    scales = []
+    for dtype in (np.float32, np.float64):
+        env = make_vec_env(pendulum, 2)
+        env.unwrapped.buf_rews = env.unwrapped.buf_rews.astype(dtype)
+        scales.append(make_agent(env, cls=StableSAC).learn(60).policy.return_scale.state_dict())
+    th.testing.assert_close(*scales, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("cls", [DelayedSAC, StableSAC, SAID])
