@@ -36,7 +36,7 @@ class ControlLoop:
 
     Where no action is planned, the last one is held for ``hold_steps``, then ``safe_action`` is sent for
     ``safe_steps``, then ``act`` raises :class:`NoAnswer`. An observation older than ``max_age`` discards what is
-    planned. Until an episode's first answer the safe action is sent.
+    planned. Until an episode's first answer the safe action is sent, for as long.
 
     Python runs one thread at a time. Where ``act`` must not wait for the few milliseconds that a model computes in
     Python, give the model a process of its own: :class:`~sb3_said.realtime.ModelProcess`.

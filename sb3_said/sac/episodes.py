@@ -9,7 +9,7 @@ from sb3_said.sac.scaling import OnTheHost
 N_EPISODES = 10  # whose mean is looked at
 LOST = 0.5  # of what was learned: by hindsight on two runs, results/stable_expert.md
 NOISE = 1.2  # standard deviations of the ten that a fall is above; where six of ten fall it is
-FORGETS = 100_000  # environment steps in which the best is forgotten, where no episode returns as much any more
+FORGETS = 100_000  # environment steps in which the best fades to 1 / e, where no episode returns as much any more
 
 
 class TrainingEpisodes(OnTheHost):

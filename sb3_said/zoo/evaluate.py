@@ -43,7 +43,8 @@ best in training, that "best" one too, or alone where the run was killed: it was
 
 With --realtime every answer is also made to wait: it takes effect at the first control step after the time that it
 took. The row "in real time" plans for that step. The row "latency ignored" plans for the step at which it was asked,
-and shows what that costs. Both hold the last action in between. Other programs on this machine count, too.
+and shows what that costs. In between the first sends the later actions of a plan, and holds the last one where there
+are none; the second holds it always. Other programs on this machine count, too.
 {TRUST}
 """
 

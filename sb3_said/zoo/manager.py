@@ -125,9 +125,9 @@ class DelayedExperimentManager(ExperimentManager):
         super().__init__(args, algo, env_id, *zoo_args, **zoo_kwargs)
         if issubclass(ALGORITHMS[algo][0], OfflineAlgorithm) and self.optimize_hyperparameters:
             raise ValueError(
-                "-optimize scores an expert in its environment, and would train a planner in each trial for nothing. "
-                "Search the expert's settings with --algo stable -optimize, and the planner's with sb3-said tune on a "
-                "trained run."
+                "-optimize scores an expert in its environment. It would train a planner in each trial for nothing; "
+                "bc and dql learn from logs. Search the expert's settings with --algo stable -optimize, and the "
+                "planner's with sb3-said tune on a trained run."
             )
         for option, number in (("n-eval-envs", self.n_eval_envs), ("eval-episodes", self.n_eval_episodes)):
             if number < 1:

@@ -37,7 +37,7 @@ examples:
 
 Runs go to LOG_FOLDER/ALGO/ENV-delayN-seedS_K (-f sets LOG_FOLDER); sb3-said evaluate and sb3-said enjoy take that
 folder. Ctrl-C, SIGTERM and SIGHUP write a checkpoint before they end the training; --resume goes on from there.
-Below: the options of rl_zoo3. -optimize is for agents without a planner, --save-replay-buffer not for logs.
+Below: the options of rl_zoo3. -optimize is for sac, sa, dr, sadr and stable, --save-replay-buffer not for logs.
 """
 
 
@@ -78,8 +78,8 @@ def own_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--preset",
         choices=PRESETS,
-        help="cpu: hours on one core; paper: the paper's table, 5 M steps and 1 M updates, with a planner for every "
-        "delay where --delay varies; quick, smoke: minutes (default: cpu)",
+        help="cpu: hours on one core; paper: the paper's table, 5 M steps and 1 M updates, with one planner for all "
+        "delays where --delay varies; quick, smoke: minutes (default: cpu)",
     )
     parser.add_argument("--seed", type=int, help="of everything drawn; part of the folder's name (default: drawn)")
     parser.add_argument(
