@@ -252,8 +252,8 @@ class DelayedExperimentManager(ExperimentManager):
             Path(self.tensorboard_log).mkdir(parents=True, exist_ok=True)
         made = super().setup_experiment()
         if made is not None and isinstance(made[0], SAID):
-            delay = self.run.delay  # which the environments of an expert with its own do not have
-            ages = ages_of(made[0].env) if delay is None else ages_under(delay)
+            has_its_own = self.run.expert_delay is not None  # then the planner's is not that of the environments now
+            ages = ages_under(self.run.delay) if has_its_own else ages_of(made[0].env)
             made[0].policy.planner.check_ages(ages)
         return made
 
