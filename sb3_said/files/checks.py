@@ -55,7 +55,7 @@ def check_argument(name: str, value: Any, cls: type) -> None:
 
 def declared(name: str, cls: type) -> Any:
     """Return the type of an argument in the first constructor that names it; ``Any`` where none does."""
-    constructors = [base.__init__ for base in cls.__mro__ if "__init__" in vars(base)]  # type: ignore[misc]
+    constructors = [vars(base)["__init__"] for base in cls.__mro__ if "__init__" in vars(base)]
     return next((hint for make in constructors for argument, hint in _hints(make).items() if argument == name), Any)
 
 

@@ -99,7 +99,7 @@ def untried(config: PlannerConfig, ways: Collection[dict[str, Any]]) -> PlannerC
     """
     mask = PlannerConfig.mask if config.mask == "own" else config.mask
     is_a_way = any(config == in_way(config, way) for way in ways)
-    named = set(SAMPLING_SETTINGS).intersection(*[set().union(*ways)]) if is_a_way else ()
+    named = set(SAMPLING_SETTINGS) & set().union(*ways) if is_a_way else set()
     return replace(config, **{name: getattr(PlannerConfig, name) for name in named}, mask=mask)
 
 

@@ -34,8 +34,9 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(argv)
     with explained(parser):
         model, statistics = load_said(args.agent), find_normalization(*find_agent(args.agent))
-        venv = DummyVecEnv([lambda: SpacesAlone(model)])
-        normalization = None if statistics is None else load_normalization(statistics, venv)
+        normalization = None
+        if statistics is not None:
+            normalization = load_normalization(statistics, DummyVecEnv([lambda: SpacesAlone(model)]))
         export(model, args.output, normalization)
     print(f"Wrote {args.output}")
     if model.reads_normalized and normalization is None:

@@ -501,11 +501,13 @@ def _decide_as_given(model: SAID, given: dict[str, Any]) -> None:
 
 def number_of(setting: Any) -> Any:
     """Return the number that a text is, for which YAML takes ``1e-3``; anything else as it is."""
+    if not isinstance(setting, str):
+        return setting
     try:
-        number = float(setting) if isinstance(setting, str) else None
+        number = float(setting)
     except ValueError:
         return setting
-    return setting if number is None else int(number) if number.is_integer() else number
+    return int(number) if number.is_integer() else number
 
 
 def has_its_planner(model: SAID) -> bool:
