@@ -42,6 +42,7 @@ from sb3_said.evaluation import confidence_interval, rollout
 from sb3_said.files.atomic import write_json
 from sb3_said.offline import Dataset, load_dataset
 from sb3_said.offline.belief import BeliefOnly
+from sb3_said.replay.windows import mean_and_deviation
 from sb3_said.zoo.runs import origin
 
 PRESENTS = "presents"  # key of the true states s_{t-D..t}
@@ -71,7 +72,7 @@ class Neighbours:
 
     def __init__(self, data: Dataset):
         states = th.as_tensor(data.states)
-        self.scale = states.std(0).clamp(min=1e-6)
+        self.scale = mean_and_deviation(states)[1]
         self.states, self.actions = states / self.scale, th.as_tensor(data.actions)
         self.squares = (self.states**2).sum(1)
         self.trajectory = th.as_tensor(np.repeat(np.arange(len(data.lengths)), data.lengths))

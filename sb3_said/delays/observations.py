@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from sb3_said.delays.space import STATE_KEYS
+
 
 def checked_observation(
     observation: Any, space: spaces.Space[Any], as_array: Callable[[Any], np.ndarray] = np.asarray
@@ -31,9 +33,12 @@ def checked_observation(
         )
     if is_delayed and not (is_dict and set(observation) == set(boxes)):
         given = f"the keys {list(observation)}" if is_dict else type(observation).__name__
+        wrapper = "DelayedObservationWrapper"
+        if is_dict and set(observation) ^ set(boxes) == set(STATE_KEYS):
+            wrapper += f"(..., state_history={'state_history' in boxes})"
         raise ValueError(
             f"The agent was built for dict observations with the keys {sorted(boxes)}, got {given}; "
-            "wrap the task in DelayedObservationWrapper."
+            f"wrap the task in {wrapper}."
         )
     parts = observation if is_dict else {"observation": observation}
     arrays = {key: _as_float32(key, parts[key], box, as_array) for key, box in boxes.items()}

@@ -16,7 +16,7 @@ from sb3_said.planner import InpaintingPlanner
 from sb3_said.planner.inpainting import newest
 from sb3_said.planner.plain import OneStepModel, ZScored
 from sb3_said.planner.yardstick import RegressionYardstick
-from sb3_said.replay.windows import Windows, WindowSource
+from sb3_said.replay.windows import Windows, WindowSource, mean_and_deviation
 
 Observation = dict[str, np.ndarray]
 
@@ -175,7 +175,7 @@ def belief_error(belief: Belief, windows: Windows, delay: int) -> float:
     history = F.pad(actions[:, :delay], (0, 0, belief.max_delay - delay, 0))  # (B, D, act_dim)
     ages = th.full((len(states),), delay, device=states.device)
     found = belief.present(states[:, 0], history, ages).to(states.device)
-    spread = windows.states[windows.valid].std(0).clamp(min=1e-6)
+    spread = mean_and_deviation(windows.states[windows.valid])[1]
     return float((((found - states[:, delay]) / spread) ** 2).mean().sqrt())
 
 
@@ -228,8 +228,11 @@ class BeliefOnly:
         is_batch = np.ndim(observation["delay"]) == 2
         batch = observation if is_batch else {key: np.asarray(value)[None] for key, value in observation.items()}
         present: Any = self.present(batch)
-        if self.age_0_spaces is not None:  # nothing was sent since, and no other state is known
-            zeros = {key: np.zeros((len(present), *box.shape), np.float32) for key, box in self.age_0_spaces.items()}
-            present = {"observation": present, **zeros}
+        if self.age_0_spaces is not None:  # no action was sent since, and no other state is known
+            seen = {key: np.zeros((len(present), *box.shape), np.float32) for key, box in self.age_0_spaces.items()}
+            history, shown = np.asarray(batch["action_history"]), seen["action_history"]  # zeros begin an episode
+            n = min(history.shape[1], shown.shape[1])
+            shown[:, shown.shape[1] - n :] = history[:, history.shape[1] - n :]
+            present = {"observation": present, **seen}
         action, state = self.actor.predict(present, state, episode_start, deterministic)
         return (action if is_batch else action[0]), state

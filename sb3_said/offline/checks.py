@@ -63,7 +63,7 @@ def checked(name: str, columns: Columns, state_space: spaces.Box, box: spaces.Bo
     shapes = {"observations": state_space.shape, "actions": box.shape, "rewards": ()}
     floats = {}
     for key, expected in (shapes | {"next_observations": state_space.shape}).items():
-        values = _numbers(name, key, columns[key])
+        values = numbers(name, key, columns[key])
         values = values[:, None] if values.ndim == 1 and expected == (1,) else values
         if values.shape[1:] != expected:
             raise ValueError(
@@ -79,7 +79,7 @@ def checked(name: str, columns: Columns, state_space: spaces.Box, box: spaces.Bo
     outside = np.any(np.abs(actions - center) > half * (1 + ACTION_TOLERANCE), axis=1)
     _refuse(name, outside, f"the action is outside the bounds {box}", actions)
     _refuse(name, terminated & ~ends, "the task ended, and the trajectory goes on", terminated)
-    follows = np.all(np.isclose(next_states[:-1], states[1:], rtol=1e-3, atol=1e-3), axis=1) | ends[:-1]
+    follows = continues(states, next_states) | ends[:-1]
     _refuse(name, ~follows, "its next observation is not that of the next row, and no flag ends it", next_states)
     return {
         "states": states,
@@ -91,7 +91,14 @@ def checked(name: str, columns: Columns, state_space: spaces.Box, box: spaces.Bo
     }
 
 
-def _numbers(name: str, key: str, values: Any) -> np.ndarray:
+def continues(states: np.ndarray, next_states: np.ndarray) -> np.ndarray:
+    """Tell which rows but the first hold the state that the step before led to: (N - 1,) bool."""
+    is_close = np.isclose(next_states[:-1], states[1:], rtol=1e-3, atol=1e-3)
+    return is_close.all(axis=tuple(range(1, is_close.ndim)))
+
+
+def numbers(name: str, key: str, values: Any) -> np.ndarray:
+    """:raises ValueError: for a column of something else"""
     column = np.asarray(values)
     if column.dtype.kind not in "biuf":
         raise ValueError(f"{name} has {key} of type {column.dtype}, expected numbers.")
@@ -100,7 +107,7 @@ def _numbers(name: str, key: str, values: Any) -> np.ndarray:
 
 def _one_a_row(name: str, key: str, values: Any) -> np.ndarray:
     """Return a column (N,) or (N, 1) as (N,)."""
-    column = _numbers(name, key, values)
+    column = numbers(name, key, values)
     if column.size != len(column):
         raise ValueError(f"{name} has {key} of shape {column.shape[1:]}, expected one number in each row.")
     return column.reshape(-1)

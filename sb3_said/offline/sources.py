@@ -14,7 +14,7 @@ import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 from tqdm.auto import tqdm
 
-from sb3_said.offline.checks import Columns, check_lengths, flags
+from sb3_said.offline.checks import Columns, check_lengths, continues, flags, numbers
 from sb3_said.replay.buffer import DelayedReplayBuffer
 
 #: Names that files give to a column. D4RL's come first, then Minari's and SB3's.
@@ -97,15 +97,24 @@ def _of_columns(name: str, given: Mapping[str, Any]) -> Columns:
 
     Without next observations, the state after a time limit is unknown: that step's state ends the trajectory instead.
     The state after a terminal step is unknown, too, and nothing is learned from it; its own stands in its place.
+    With them, files need not say where episodes were cut off, as those of ``d4rl.qlearning_dataset`` do not.
     """
     found = {ours: next((n for n in names if n in given), None) for ours, names in COLUMNS.items()}
-    if lacking := [COLUMNS[key] for key in COLUMNS if found[key] is None and key != "next_observations"]:
+    not_needed = {"next_observations"} if found["next_observations"] is None else {"truncated"}
+    if lacking := [COLUMNS[key] for key in COLUMNS if found[key] is None and key not in not_needed]:
         hint = " 'dones' do not say whether the task or a time limit ended an episode." if "dones" in given else ""
         raise ValueError(
             f"{name} has the columns {', '.join(sorted(given))} and none of {' or '.join(lacking[0])}.{hint}"
         )
     columns = {key: np.asarray(given[theirs]) for key, theirs in found.items() if theirs is not None}
     check_lengths(name, columns)
+    if "truncated" not in columns:
+        states, next_states = (numbers(name, key, columns[key]) for key in ("observations", "next_observations"))
+        if states.shape != next_states.shape:
+            raise ValueError(
+                f"{name} has observations of {states.shape}, and next_observations of {next_states.shape}."
+            )
+        columns["truncated"] = np.append(~continues(states, next_states), True)
     for key in ("terminated", "truncated"):
         columns[key] = flags(name, str(found[key]), columns[key])
     columns["ends"] = columns["terminated"] | columns.pop("truncated")

@@ -99,6 +99,7 @@ def write_dataset(
     if spec is not None:  # what was registered, with the arguments that were given; its own lacks the time limit
         spec, kwargs = copy.deepcopy(gym.spec(spec.id)), spec.kwargs
         spec.kwargs = {**spec.kwargs, **kwargs}
+        spec.max_episode_steps = (env.spec or spec).max_episode_steps
     told = None if spec is None else _without_code(spec, os.fspath(target))
     reference = reference_returns(spec.id) if spec is not None else None
     scores = {} if reference is None else {"ref_min_score": reference[0], "ref_max_score": reference[1]}

@@ -32,11 +32,13 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "value_scale": VALUE_SCALES,
     "precision": ("auto", "float32", "bfloat16"),
 }
-AT_LEAST = {"depth": 1, "horizon": 2, "sampling_steps": 1, "n_candidates": 1, "batch_size": 1} | dict.fromkeys(
-    ("temperature", "choice_factor", "warmup_steps", "weight_decay", "weight_factor", "decision_weight"), 0
-)
-#: Far beyond what helps: a setting above is a slip, and would ask for memory or hours.
+PARTS = ("end_time_probability", "early_probability", "mask_end_probability", "extra_state_probability", "ema_decay")
+NOT_NEGATIVE = ("temperature", "choice_factor", "warmup_steps", "weight_decay", "weight_factor", "decision_weight")
+AT_LEAST = {"depth": 1, "horizon": 2, "sampling_steps": 1, "n_candidates": 1, "batch_size": 1}
+AT_LEAST |= dict.fromkeys((*NOT_NEGATIVE, *PARTS), 0)
+#: Far beyond what helps, but of parts: a setting above is a slip, and would ask for memory or hours.
 AT_MOST = {"depth": 1000, "d_model": 16_384, "horizon": 1000, "sampling_steps": 1000, "n_candidates": 10_000}
+AT_MOST |= dict.fromkeys(PARTS, 1)
 
 
 @dataclass(frozen=True)
@@ -136,15 +138,6 @@ class PlannerConfig:
                 f"learning_rate is {self.learning_rate} and gradient_clip {self.gradient_clip}, expected positive "
                 "numbers; to switch clipping off, give gradient_clip=None."
             )
-        for name in (
-            "end_time_probability",
-            "early_probability",
-            "mask_end_probability",
-            "extra_state_probability",
-            "ema_decay",
-        ):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, expected a number in [0, 1].")
 
     def _settle_present(self) -> None:
         """:raises ValueError: for a guessed present where nothing guesses, and any other where none is inpainted"""

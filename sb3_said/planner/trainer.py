@@ -223,7 +223,12 @@ class PlannerTrainer:
         """Learn how far the guess is right, and let nothing change it any more."""
         assert self.online.first_guess is not None  # it was just made
         self.online.first_guess.requires_grad_(False)
-        self.online.fit_prior(self.source.sample(N_PRIOR_WINDOWS, self.online.window_length, self.generator))
+        if len(self.source) > N_PRIOR_WINDOWS:
+            windows = self.source.sample(N_PRIOR_WINDOWS, self.online.window_length, self.generator)
+        else:  # each once, so that the prior knows how few there are
+            every = th.arange(len(self.source), device=self.source.rows.device)
+            windows = self.source.gather(every, self.online.window_length)
+        self.online.fit_prior(windows)
         self.average.load_state_dict(self.online.state_dict())
 
     def _descend(self) -> tuple[th.Tensor]:

@@ -46,7 +46,7 @@ def returns_to_go(
     elif cut.any():
         raise ValueError(
             f"An episode that goes on has a finite value only with gamma < 1, got gamma={gamma}: give a smaller "
-            "one, or train an expert first, whose critics tell what it is worth."
+            "one. (Of an expert's own steps its critics tell what they are worth, with any gamma.)"
         )
 
     order = (source.episodes * (int(source.remaining.max()) + 1) + source.remaining).argsort()  # newest step first

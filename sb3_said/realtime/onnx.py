@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_said.delays.observations import checked_observation
-from sb3_said.delays.space import delayed_space, within_bounds
+from sb3_said.delays.space import STATE_KEYS, delayed_space, within_bounds
 
 
 class OnnxModel:
@@ -53,6 +53,8 @@ class OnnxModel:
         :raises ValueError: as :func:`~sb3_said.delays.observations.checked_observation`, and for an answer that is
             not finite
         """
+        if isinstance(observation, dict):  # it learned without them, whatever its planner reads
+            observation = {key: part for key, part in observation.items() if key not in STATE_KEYS}
         given, is_batch = checked_observation(observation, self.observation_space)
         action: np.ndarray = self._session.run(["action"], given)[0]
         if not np.isfinite(action).all():

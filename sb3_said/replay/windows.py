@@ -57,6 +57,7 @@ class WindowSource:
     :param values: (n_starts,) float32, a value of each start's state, by which a trainer may weigh windows
     :param ages: (n_starts,) int64, of the observation that each start's action was decided on, in control steps; None
         where that is not known, as in logs
+    :raises ValueError: for states, actions, rewards or values of another dtype
     """
 
     states: th.Tensor
@@ -69,6 +70,11 @@ class WindowSource:
     episodes: th.Tensor
     values: th.Tensor
     ages: th.Tensor | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("states", "actions", "rewards", "values"):
+            if (dtype := getattr(self, name).dtype) != th.float32:
+                raise ValueError(f"{name} are {dtype}, expected torch.float32: give {name}.float().")
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -90,7 +96,8 @@ class WindowSource:
         :param length: L, steps of a window
         :param generator: torch's global one of the CPU by default
         :param early_probability: of a start whose episode is uniform over all episodes, and the logarithm of whose step
-            is uniform: as many in steps 1 to 10 of an episode as in 10 to 100
+            is uniform: as many in steps 1 to 10 of an episode as in 10 to 100. An episode whose first steps are not
+            here begins with the first that is
         """
         return self.gather(self._draw(batch_size, generator, early_probability)[0], length)
 

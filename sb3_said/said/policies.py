@@ -179,6 +179,8 @@ class SAIDPolicy(DelayedSACPolicy):
                 n = expert_up_to + 1
             elif expert_from is not None and expert_up_to is None and 0 < expert_from <= self.max_delay:
                 n = expert_from - n_ages
+            if self.max_delay == 0:
+                raise ValueError("Without delay there is no age but 0, at which one answers: 'planner' or 'expert'.")
             if n == 0:
                 raise ValueError(
                     f"expert_up_to is {expert_up_to} and expert_from {expert_from}, expected one of them: the expert "

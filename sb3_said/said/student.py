@@ -14,6 +14,7 @@ from torch.nn import functional as F
 from tqdm.auto import tqdm
 
 from sb3_said.delays.space import KEYS, check_spaces
+from sb3_said.planner.checks import check_settings
 from sb3_said.planner.plain import ZScored, plain_network
 from sb3_said.replay.windows import WindowSource
 from sb3_said.sac.extractors import StateAugmentedExtractor
@@ -47,11 +48,11 @@ class Distillation:
     alone, which knows the true state s_t"""
 
     def __post_init__(self) -> None:
-        counts = {name: getattr(self, name) for name in ("n_labels", "gradient_steps", "batch_size")}
-        if min(counts.values()) < 1 or self.own_steps < 0 or self.rounds < 0:
-            raise ValueError(f"Expected {', '.join(counts)} of at least 1, own_steps and rounds of at least 0: {self}")
-        if not (self.learning_rate > 0 and self.q_weight >= 0):
-            raise ValueError(f"Expected a learning_rate above 0 and a q_weight of at least 0: {self}")
+        check_settings(
+            self, {"n_labels": 1, "own_steps": 0, "rounds": 0, "gradient_steps": 1, "batch_size": 1, "q_weight": 0}
+        )
+        if not self.learning_rate > 0:
+            raise ValueError(f"learning_rate is {self.learning_rate}, expected a number above 0.")
 
 
 class Student(ZScored):
@@ -153,7 +154,7 @@ def distill(model: SAID, config: Distillation, progress_bar: bool = False) -> fl
         drawn = th.randint(len(rows.inputs), (config.batch_size,), generator=generator).to(rows.inputs.device)
         loss = _loss(model, rows[drawn], config.q_weight)
         optimizer.zero_grad()
-        loss.backward()
+        loss.backward(inputs=[*student.network.parameters()])  # Q's own have no use for it
         optimizer.step()
         schedule.step()
     with th.no_grad():

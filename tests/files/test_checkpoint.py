@@ -170,6 +170,19 @@ def test_any_number_of_a_replay_tells_it_from_another(name):
     assert checksum(model) == before
 
 
+def test_the_last_states_of_episodes_tell_replays_apart():
+    """Values of what a time limit cut off are learned from them."""
+    model = make().learn(40)
+    before, tails = checksum(model), model.replay_buffer.tails
+    place, (state, age) = next(iter(tails.items()))
+    tails[place] = state + 1, age
+    assert checksum(model) != before
+    tails[place] = state, age
+    assert checksum(model) == before
+    model.replay_buffer._next_states += 1
+    assert checksum(model) != before
+
+
 def test_random_states_come_back(tmp_path):
     random.gauss(0, 1)  # Python keeps a second number for the next call
     np.random.normal()  # so does NumPy

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch as th
 from linear_system import make_source
+from small_agent import make, observe
 from small_planner import make_batch, make_planner
 from small_task import Drift, delayed
 from test_bc import demonstrations
@@ -145,10 +146,22 @@ def test_an_error_is_in_deviations_of_states_that_are_in_an_episode():
     windows = held_out()
     states, valid = windows.states.clone(), windows.valid.clone()
     valid[:100, 2:], states[:100, 2:] = False, 1e3
-    spread = states[valid].std(0)
+    spread = states[valid].std(0, correction=0)
     expected = (((states[:, 0] - states[:, 2]) / spread) ** 2)[valid[:, 2]].mean().sqrt()
     found = belief_error(Stale(), windows._replace(states=states, valid=valid), 2)
     assert found == pytest.approx(expected.item(), rel=1e-5)
+
+
+def test_an_entry_that_never_moves_does_not_blow_an_error_up():
+    windows = held_out()
+    error = belief_error(Stale(), windows, 2)
+    states = th.cat([windows.states, th.full_like(windows.states[..., :1], 5.0)], -1)
+
+    class Nearly(Stale):
+        def present(self, state, action_history, delay):
+            return state + 1e-3 * th.tensor([0.0, 0.0, 1.0])
+
+    assert belief_error(Nearly(), windows._replace(states=states), 2) == pytest.approx((2 / 3) ** 0.5 * error, rel=1e-3)
 
 
 def test_no_window_reaches_a_delay_that_no_episode_does():
@@ -203,6 +216,25 @@ def test_an_actor_of_ours_is_asked_at_age_0(state_history, recwarn):
     shown |= {"state_history": np.zeros((2, 2)), "state_known": np.zeros(2)} if state_history else {}
     np.testing.assert_array_equal(action, actor.predict(shown, deterministic=True)[0])
     assert not [w for w in recwarn if "learned at ages" in str(w.message)]
+
+
+@pytest.mark.parametrize("actors_delay", [2, 5])
+def test_an_actor_of_two_is_asked_as_amid_the_episode(actors_delay):
+    """No actions at all are how an episode begins, where the one of the largest age decides."""
+    actor = make(delayed(delay=(0, actors_delay)), planner_kwargs={"temperature": 0.0})
+    actor.learn(60)
+    actor.set_answer("both", expert_up_to=1)
+    agent, obs = BeliefOnly(Truth(), actor), observe(env=delayed(delay=DELAY))
+    found = agent.predict(obs, deterministic=True)[0]
+    none = np.zeros((len(found), actors_delay, 1), np.float32)
+    shown = {"observation": agent.present(obs), "action_history": none, "delay": np.zeros((len(found), 1), np.float32)}
+    with actor.policy.answering("expert"):
+        experts = actor.predict(shown, deterministic=True)[0]
+    with actor.policy.answering("planner"):
+        planners = actor.predict(shown, deterministic=True)[0]
+    begins = (obs["action_history"][:, -actors_delay:] == 0).all((1, 2))
+    assert begins.any() and not begins.all()
+    np.testing.assert_allclose(found, np.where(begins[:, None], planners, experts), atol=1e-6)
 
 
 def test_what_does_not_fit_is_refused():

@@ -88,6 +88,16 @@ def test_without_next_observations_a_time_limit_costs_its_last_step(log, tmp_pat
     np.testing.assert_array_equal(data.states, np.delete(log["observations"], [5, 12], axis=0))
 
 
+@pytest.mark.parametrize("rounded", [False, True])
+def test_with_next_observations_time_limits_need_not_be_told(rounded, log, tmp_path):
+    """As in what ``d4rl.qlearning_dataset`` returns."""
+    whole = load(write(tmp_path / "whole.npz", log))
+    del log["timeouts"]
+    if rounded:
+        log["next_observations"] = log["next_observations"] + 1e-5
+    same(load(write(tmp_path / "log.npz", log)), replace(whole, finals=whole.finals + 1e-5 * rounded))
+
+
 def test_other_names_mean_the_same(log, tmp_path):
     renamed = dict(
         zip(("obs", "actions", "rewards", "terminations", "truncations", "next_obs"), log.values(), strict=True)
@@ -228,6 +238,17 @@ def test_a_minari_dataset_is_read_by_its_id(log, tmp_path, monkeypatch):
         load("test/nothing-v0")
 
 
+def test_a_minari_dataset_says_the_time_limit_of_its_environment(tmp_path, monkeypatch):
+    minari = pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    env = gym.make("Pendulum-v1", max_episode_steps=15)
+    states = np.random.default_rng(0).normal(size=(16, 3)).astype(np.float32)
+    nothing, last = np.zeros(15, bool), np.arange(15) == 14
+    data = Dataset(states[:-1], np.zeros((15, 1), np.float32), np.zeros(15, np.float32), nothing, last, states[-1:])
+    write_dataset(data, "mine/short-v0", env)
+    assert minari.load_dataset("mine/short-v0").env_spec.max_episode_steps == 15
+
+
 def test_a_combined_minari_dataset_has_all_episodes(log, tmp_path, monkeypatch):
     minari = pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
@@ -304,6 +325,10 @@ def twice(column):
     return np.stack([column] * 2, axis=1)
 
 
+def untold(log, next_observations):
+    return {key: x for key, x in log.items() if key != "timeouts"} | {"next_observations": next_observations}
+
+
 def broken(log, key, row, value):
     log[key] = np.array(log[key], np.float64)
     log[key][row] = value
@@ -322,7 +347,7 @@ def broken(log, key, row, value):
         (lambda log: log | {"rewards": log["rewards"][:-1]}, "differ in length"),
         (lambda log: log | {"observations": log["observations"][:, :2]}, r"of shape \(2,\), and the task \(3,\)"),
         (lambda log: {k: v for k, v in log.items() if k != "actions"}, "none of actions"),
-        (lambda log: {{"timeouts": "dones"}.get(k, k): v for k, v in log.items()}, "'dones' do not say"),
+        (lambda log: {{"terminals": "dones"}.get(k, k): v for k, v in log.items()}, "'dones' do not say"),
         (lambda log: {k: v[:0] for k, v in log.items()}, "or are empty"),
         (lambda log: broken(log, "rewards", 1, 1e300), "Row 1 of .*: rewards must be finite"),  # in float32
         (lambda log: broken(log, "terminals", 3, np.nan), r"Row 3 of .*log\.npz: terminals must be 0 or 1, got nan"),
@@ -330,6 +355,8 @@ def broken(log, key, row, value):
         (lambda log: log | {"rewards": twice(log["rewards"])}, r"log\.npz has rewards of shape \(2,\), expected one"),
         (lambda log: log | {"terminals": twice(log["terminals"])}, r"log\.npz has terminals of shape \(2,\)"),
         (lambda log: log | {"actions": log["actions"].astype(str)}, "has actions of type <U"),
+        (lambda log: untold(log, log["observations"][:, :2]), r"observations of \(13, 3\), and next_.* of \(13, 2\)"),
+        (lambda log: untold(log, log["observations"].astype(str)), "has next_observations of type <U"),
     ],
 )  # fmt: skip
 def test_what_is_no_log_of_the_task_is_refused(change, message, log, tmp_path):

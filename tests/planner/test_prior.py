@@ -10,7 +10,7 @@ from small_planner import ACT, DELAY, LENGTH, OBS, FakeNetwork, make_planner, ma
 
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner.diffusion import gaussian_prediction
-from sb3_said.planner.prior import LEAST_STD, Prior
+from sb3_said.planner.prior import FEWEST_WINDOWS, LEAST_STD, Prior
 from sb3_said.planner.trainer import PlannerTrainer
 
 D, HORIZON = 4, 3
@@ -66,6 +66,21 @@ def trainer() -> PlannerTrainer:
         trainer = PlannerTrainer(InpaintingPlanner(STATE_DIM, ACTION_DIM, D, small), make_source(), gradient_steps=50)
     trainer.make_first_guess()
     return trainer
+
+
+def test_of_few_windows_none_counts_twice():
+    """One that is drawn ten times would be taken for ten, and what it shows for sure."""
+    with th.random.fork_rng(devices=[]):
+        th.manual_seed(0)
+        small = PlannerConfig(depth=1, d_model=32, horizon=HORIZON, present="inpainted", precision="float32")
+        source = make_source()
+        few = source._select((source.episodes == source.episodes[0]) & (source.remaining <= D + FEWEST_WINDOWS + 1))
+        trainer = PlannerTrainer(InpaintingPlanner(STATE_DIM, ACTION_DIM, D, small), few, gradient_steps=1)
+        trainer.make_first_guess()
+    n = trainer.average.window_length
+    reached = (trainer.source.remaining[:, None] > th.arange(n)).sum(0)  # windows that have a step
+    is_new = (trainer.average.prior.std[D, :n] == 1).all(1)
+    assert reached[D:].tolist() == [10, 9, 8] and is_new[D:].tolist() == [False, True, True]
 
 
 @th.no_grad()

@@ -281,6 +281,12 @@ def test_split_needs_two_steps():
         make_source([1]).split(0.1)
 
 
+def test_arrays_of_another_dtype_are_told():
+    source = make_source([2, 3])
+    with pytest.raises(ValueError, match=r"states are torch\.float64, expected torch\.float32: give states\.float\(\)"):
+        replace(source, states=source.states.double())
+
+
 def test_dimensions_and_starts():
     source = make_source([2, 3])
     assert (len(source), source.obs_dim, source.act_dim) == (5, 2, 1)

@@ -119,6 +119,18 @@ def test_it_answers_and_refuses_what_the_agent_does(tmp_path):
         loaded.predict(obs["observation"])
 
 
+def test_it_plays_where_its_agent_does_with_a_state_history_that_it_does_not_read(tmp_path):
+    env = DelayedObservationWrapper(Drift(), (0, 2), state_history=True)
+    model = teach(make(env, planner_kwargs={"extra_state_probability": 0.5}))
+    export(model, tmp_path / "agent.onnx")
+    obs = observe(env=env)
+    with model.policy.answering("student"):
+        wanted = model.predict(obs, deterministic=True)[0]
+    np.testing.assert_allclose(OnnxModel(tmp_path / "agent.onnx").predict(obs)[0], wanted, rtol=1e-5, atol=1e-6)
+    with pytest.raises(ValueError, match=r"wrap the task in DelayedObservationWrapper\(\.\.\., state_history=False\)"):
+        make().predict(obs)
+
+
 def test_a_file_of_another_program_is_told(tmp_path):
     model = teach(make())
     export(model, tmp_path / "agent.onnx")

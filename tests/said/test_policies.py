@@ -556,6 +556,13 @@ def test_where_no_expert_has_learned_its_actor_does_not_decide(tmp_path):
     np.testing.assert_array_equal(answer(loaded, obs), answer(model, obs))
 
 
+def test_without_delay_there_are_no_ages_to_share():
+    model = make(Drift())
+    model.learn(40)
+    with pytest.raises(ValueError, match="Without delay there is no age but 0"):
+        model.set_answer("both", expert_up_to=0)
+
+
 def test_both_need_an_age_and_keep_what_each_has_met(saved, tmp_path):
     model = SAID.load(saved, device="cpu")
     max_delay = model.policy.max_delay

@@ -272,7 +272,13 @@ def test_parameters_with_a_student_ask_for_one_of_its_width(width, own, taught, 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
-    [({"width": 0}, "student_width is 0"), ({"batch_size": 0}, "batch_size"), ({"q_weight": -1.0}, "q_weight")],
+    [
+        ({"width": 0}, "student_width is 0"),
+        ({"batch_size": 0}, "batch_size is 0, expected at least 1"),
+        ({"q_weight": -1.0}, "q_weight is -1.0, expected at least 0"),
+        ({"n_labels": 1e2}, "n_labels is 100.0, expected a whole number"),
+        ({"learning_rate": 0.0}, "learning_rate is 0.0, expected a number above 0"),
+    ],
 )
 def test_settings_that_cannot_be_are_refused_and_the_student_stays(taught, settings, message):
     before = taught.policy.student
