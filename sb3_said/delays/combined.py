@@ -164,7 +164,11 @@ class TotalDelay(BaseProcess):
         :return: one number for the episode where both are
         """
         added = packet_delays(self.action, rng.spawn(1)[0])
-        assert isinstance(added, itertools.repeat), self.action
+        if not isinstance(added, itertools.repeat):
+            raise ValueError(
+                f"{self.action!r} drew a delay for all actions of an episode at first, and one for each now; as an "
+                "action delay a process draws always the one or always the other."
+            )
         k, delays = next(added), packet_delays(self.observation, rng)
         if isinstance(delays, itertools.repeat):
             return next(delays) + k

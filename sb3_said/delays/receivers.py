@@ -108,7 +108,7 @@ class Actuator:
     def __init__(self, receiver: NewestPacket, memory: int):
         self.receiver = receiver
         self._sent: deque[np.ndarray] = deque(maxlen=int(receiver.process.max_delay) + 1)
-        self._ages: deque[int] = deque(maxlen=int(memory) + 1)  # of what was executed in the newest steps
+        self._ages: deque[int] = deque(maxlen=int(memory) + 1)  # of the youngest executed by each of the newest steps
 
     def reset(self, rng: np.random.Generator) -> None:
         """Start an episode. Until the next reset, ``rng`` draws the action delays."""
@@ -120,10 +120,10 @@ class Actuator:
         """Send an action (act_dim,), and return the one that this step executes, sent now or earlier."""
         age = self.receiver.step() if self._sent else 0
         self._sent.append(np.array(action))
-        self._ages.append(age)
+        self._ages.append(min(age, self._ages[-1] + 1) if self._ages else age)  # an older one may follow a younger
         return self._sent[-1 - age]
 
     def lag(self, age: int) -> int:
         """Return how many actions, sent before the state of an age, do not show in it yet."""
-        # That is the age of the action whose execution led to the state. No action leads to s_0.
+        # That is the age of the youngest action whose execution led there. No action leads to s_0.
         return self._ages[-1 - age] if age < len(self._ages) else 0

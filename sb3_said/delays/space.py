@@ -40,9 +40,12 @@ def check_task(observation_space: spaces.Space[Any], action_space: spaces.Space[
         advice = flat if observation_space.is_np_flattenable else "give the task one, of a fixed length"
         raise ValueError(f"Expected a 1-D Box observation, got {observation_space}; {advice}.")
     if not isinstance(action_space, spaces.Box):
+        advice = "so let the agent see one, with gymnasium.wrappers.TransformAction"
+        if isinstance(action_space, (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)):
+            advice = "so a task with discrete actions is not supported. Take its continuous variant where it has one"
         raise ValueError(
             f"Expected a 1-D Box action, got {action_space}: agents here, as SAC, answer with real numbers between "
-            "bounds, so a task with discrete actions is not supported. Take its continuous variant where it has one."
+            f"bounds, {advice}."
         )
     if len(action_space.shape) != 1:
         raise ValueError(

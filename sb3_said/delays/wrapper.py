@@ -98,9 +98,9 @@ class DelayedObservationWrapper(
         self.process = make_process(delay)
         if action_delay != 0:
             self.process = TotalDelay(self.process, make_process(action_delay))
-        longest = self.process.max_delay if max_delay is None else max_delay
-        self.max_delay = checked_count("max_delay", longest, 0, LARGEST_DELAY)
-        if self.max_delay < self.process.max_delay:
+        largest = checked_count(f"max_delay of {self.process}", self.process.max_delay, 0, LARGEST_DELAY)
+        self.max_delay = largest if max_delay is None else checked_count("max_delay", max_delay, 0, LARGEST_DELAY)
+        if self.max_delay < largest:
             raise ValueError(f"max_delay={max_delay} is smaller than the largest delay {self.process.max_delay}.")
         if receiver not in RECEIVERS:
             raise ValueError(f"receiver is {receiver!r}, expected one of {tuple(RECEIVERS)}.")
@@ -123,6 +123,7 @@ class DelayedObservationWrapper(
         self._states = np.zeros((n, *obs_space.shape), np.float32)  # s_{t-D..t}
         self._known = np.zeros(n, np.float32)  # which of these were handed out
         self._shown = 0  # age of the state that was handed out last
+        self._is_over = True  # the episode, or none has begun
 
     def make_receivers(self) -> tuple[NewestPacket, Actuator | None]:
         """Return new receivers of observations, and of actions where each takes a time of its own."""
@@ -166,18 +167,29 @@ class DelayedObservationWrapper(
             self.actuator.reset(self._rng.spawn(1)[0])
         self.receiver.reset(self._rng)
         self._actions[:] = self._states[:] = self._known[:] = 0.0
+        self._is_over = False
         return self._observe(state, age=0), self._with_own(info)
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict[str, Any]]:
         """Send the action; observe what has arrived.
 
         :param action: (act_dim,), in the units of the action space
-        :raises ValueError: when the process draws a delay outside 0..max_delay, or the task's answer is malformed
+        :raises ResetNeeded: where no episode has begun, or the last one has ended
+        :raises ValueError: for an action of another shape, when the process draws a delay outside 0..max_delay, or the
+            task's answer is malformed
         """
+        if self._is_over:
+            raise gym.error.ResetNeeded(
+                "Call reset() first: no episode has begun, or the last one has ended. What resets a task by itself, "
+                "such as gymnasium.wrappers.Autoreset, goes around DelayedObservationWrapper."
+            )
+        if np.shape(action) != self._actions.shape[1:]:
+            raise ValueError(f"The action has the shape {np.shape(action)}, expected {self._actions.shape[1:]}.")
         state: Any
         executed = action if self.actuator is None else self.actuator.execute(action)
         state, reward, terminated, truncated, info = self.env.step(np.array(executed))  # which a task may change
         self._check_answer(state, info)
+        self._is_over = bool(terminated or truncated)
         _append(self._actions, scale_action(action, self._task_action_space))
         age = self.receiver.step()
         lag, shown = (0, None) if self.actuator is None else (self.actuator.lag(age), executed)

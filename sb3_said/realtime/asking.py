@@ -58,7 +58,7 @@ class Asking:
         space = self.model.observation_space
         state_shape = (space["observation"] if isinstance(space, spaces.Dict) else space).shape or ()
         history = np.zeros((self.max_delay, *self.model.action_space.shape), np.float32)
-        dummy = Request(-1, 0, 0, np.zeros(state_shape, np.float32), history, self.max_delay)
+        dummy = Request(-1, 0, 0, 0, np.zeros(state_shape, np.float32), history, self.max_delay)
         if hasattr(self.model, "warmup"):
             self.model.warmup()
         self.answer(dummy)  # a ModelProcess has a warmup() whatever its model has
@@ -68,7 +68,8 @@ class Asking:
 def plan_of(model: Any, observation: Any, deterministic: bool) -> np.ndarray:
     """Return a plan for each observation of a batch: (B, K, act_dim), of one action where a model does not plan.
 
-    :raises ValueError: for a model with a memory, whose answer depends on the answers before
+    :raises ValueError: for a model with a memory, whose answer depends on the answers before, and for an answer that is
+        not of a batch
     """
     if hasattr(model, "predict_plan"):
         return np.asarray(model.predict_plan(observation, deterministic=deterministic))
@@ -78,4 +79,9 @@ def plan_of(model: Any, observation: Any, deterministic: bool) -> np.ndarray:
             f"{type(model).__name__} answers with a memory, of type {type(memory).__name__}, which is not kept between "
             "answers that may come late or never: give a model without one, such as one that reads the actions sent."
         )
-    return np.asarray(action)[:, None]
+    action = np.asarray(action)
+    if action.ndim != 2:
+        raise ValueError(
+            f"{type(model).__name__} answers {action} of the shape {action.shape}, expected (B, act_dim) for a batch."
+        )
+    return action[:, None]

@@ -25,7 +25,10 @@ class NoAnswer(RuntimeError):
 class Request(NamedTuple):
     """What a model is asked, and for which action."""
 
-    episode: int
+    era: int
+    """as of the ledger; an answer of another one is of no use"""
+    n_seen: int
+    """observations taken before it is asked"""
     n_sent: int
     """actions sent when it is asked"""
     target: int
@@ -75,13 +78,14 @@ class Ledger:
         self.period, self.action_delay = period, action_delay
         self.max_delay, self.max_age = max_delay, max_age
         self.hold_steps, self.safe_action = hold_steps, safe_action
-        self.episode = -1
+        self.era = -1  # ends with an episode, and where what was planned is discarded
         self.start_episode(math.nan)
 
     def start_episode(self, began: float) -> None:
         """Forget all; observations captured before ``began``, NaN if unknown, are of another episode."""
-        self.episode += 1
-        self.n_sent = self.n_missing = 0
+        self.era += 1
+        self.n_sent = self.n_missing = self.n_seen = 0
+        self.begins_on = 0  # n_seen of the answer that begins the episode
         self.is_answered = False
         self.observation: np.ndarray | None = None
         self.captured, self._n_shown, self._is_stamped = began, 0, True
@@ -140,6 +144,7 @@ class Ledger:
         elif n_executed == self._n_shown < self.n_sent and np.array_equal(state, self.observation):  # type: ignore[arg-type]
             return False  # a frozen sensor; a robot that has executed all may as well stand still
         self.observation, self._n_shown, self._is_stamped = state, n_executed, capture_time is not None
+        self.n_seen += 1
         return True
 
     def turn_back(self, now: float, expected: float) -> None:
@@ -164,8 +169,9 @@ class Ledger:
             coming = np.stack([step.action for step in self._coming(n_steps)])
             scaled = scale_action(coming, self.action_space).astype(np.float32)
             history = np.concatenate([history, scaled])[-self.max_delay :]
+        observation, history = self.observation.copy(), history.copy()  # which whoever is asked may change
         target = self.n_sent + n_steps
-        return Request(self.episode, self.n_sent, target, self.observation, history.copy(), self.age + n_steps)
+        return Request(self.era, self.n_seen, self.n_sent, target, observation, history, self.age + n_steps)
 
     def splice(self, actions: np.ndarray, target: int) -> int:
         """Plan actions from a number on, in place of what was planned there.
@@ -187,9 +193,13 @@ class Ledger:
         return number in self._planned
 
     def next_step(self) -> Step:
-        """Return what to send next. An observation that is too old discards what is planned."""
-        if self.observation is not None and self.age > self.max_age:
+        """Return what to send next. An observation that is too old discards what is planned.
+
+        An answer that is on its way was told that it would be sent, and is discarded, too.
+        """
+        if self._planned and self.observation is not None and self.age > self.max_age:
             self._planned.clear()
+            self.era += 1
         return next(self._coming(1))
 
     def send(self, step: Step, now: float) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from sb3_said.delays.processes import checked_count
-from sb3_said.delays.space import check_spaces, unscale_action
+from sb3_said.delays.space import check_spaces, unscale_action, within_bounds
 from sb3_said.realtime.asking import Asking
 from sb3_said.realtime.ledger import Ledger, NoAnswer, Request
 from sb3_said.realtime.statistics import LoopStatistics
@@ -99,10 +99,11 @@ class ControlLoop:
             raise ValueError(
                 f"max_age is {max_age}, but the model reads ages 0..{max_delay}; train it with a larger max_delay."
             )
-        middle = unscale_action(np.zeros(space.shape), space)
-        safe = middle if safe_action is None else np.array(safe_action, space.dtype)
-        if not space.contains(safe):
+        safe = unscale_action(np.zeros(space.shape), space) if safe_action is None else np.asarray(safe_action)
+        # Before a cast to whole numbers, in which 300 may be 44
+        if safe.shape != space.shape or not np.all((space.low <= safe) & (safe <= space.high)):
             raise ValueError(f"safe_action is {safe_action}, expected an action of {space}.")
+        safe = within_bounds(safe, space)
         self.period, self.count_latency, self._simulate = period, count_latency, simulate
         self._max_missing = math.inf if hold_steps is None or safe_steps is None else hold_steps + safe_steps
         #: n, steps that the next answer is expected to take.
@@ -235,8 +236,9 @@ class ControlLoop:
                 raise NoAnswer(f"No action was planned for {step.n_missing} steps. Counted so far: {self._statistics}")
             self._count(step.n_missing, now)
             self._ledger.send(step, now)
-            if not self._has_heard:  # ask again: the same observation is a step older
-                self._ask()
+            is_planned = self._ledger.is_planned(self.n_sent + self.answer_steps)
+            if not (self._has_heard and (self._is_busy or self._asked or is_planned)):
+                self._ask()  # again: the same observation is a step older
             self._has_heard = self._stands = False
             self._note(now, clock)
             return step.action.copy()
@@ -245,7 +247,7 @@ class ControlLoop:
         """Block until the model has answered what has come so far, and tell whether it has.
 
         Before the first action of an episode the robot stands, so that no action is sent meanwhile: then the answer
-        that this waits for begins with that one.
+        that this waits for, to the newest observation, begins with that one.
 
         :param timeout: in seconds; None for no limit
         :raises RuntimeError: where the model has failed, or the loop is closed
@@ -259,7 +261,7 @@ class ControlLoop:
                 self._stands = False
                 return True
             is_answered = self._wait(ends)
-            if is_answered and self.n_sent == 0 and not self._ledger.is_planned(0):
+            if is_answered and self.n_sent == 0 and self._ledger.begins_on < self._ledger.n_seen:
                 self._stands = True
                 self._ask()
                 is_answered = self._wait(ends)
@@ -318,9 +320,10 @@ class ControlLoop:
         if ledger.observation is not None:
             counted.count(age=ledger.age)
         if n_missing > 0:
-            kind = "held" if n_missing <= ledger.hold_steps else "safe"
-            name = f"{kind if ledger.is_answered else 'waiting'}_steps"
-            setattr(counted, name, getattr(counted, name) + 1)
+            counted.waiting_steps += not ledger.is_answered
+            is_held = n_missing <= ledger.hold_steps
+            counted.held_steps += ledger.is_answered and is_held
+            counted.safe_steps += ledger.is_answered and not is_held
         if ledger.n_sent > 0:
             counted.count(gap=(now - self._acted) / self.period)
 
@@ -367,9 +370,9 @@ class ControlLoop:
                     self._in_flight = asked, actions, self.n_sent + int(busy_steps(seconds))
 
     def _take(self, request: Request, actions: np.ndarray) -> None:
-        """Splice an answer in, unless it is of an episode that has ended."""
+        """Splice an answer in, unless it is of an episode that has ended, or of a plan that was discarded."""
         ledger = self._ledger
-        if request.episode != ledger.episode:
+        if request.era != ledger.era:
             return
         if ledger.n_sent > 0 and not self._stands:  # else no step goes by however long an answer takes
             took = ledger.n_sent - request.n_sent
@@ -380,6 +383,8 @@ class ControlLoop:
             self._statistics.late_answers += ledger.splice(actions, request.target) > 0
         else:
             ledger.splice(actions[:1], ledger.n_sent)
+        if request.target == 0:
+            ledger.begins_on = request.n_seen
 
     def _expect(self, answer_steps: int) -> None:
         if not self._answer_steps_given:

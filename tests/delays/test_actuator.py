@@ -1,6 +1,7 @@
 """Delays of actions: which action each step executes, and what the observations then show."""
 
 from collections import deque
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -26,7 +27,7 @@ class Robot:
     """A task as it is: actions queue up on their way to it, observations on their way back."""
 
     def __init__(self, name, n_there, n_back, seed):
-        self.env = gym.make(name)
+        self.env = gym.make(name, terminate_when_unhealthy=False)
         self.state = self.env.reset(seed=seed)[0]
         self.there = deque([None] * n_there)
         self.back = deque([self.state] * n_back)
@@ -47,11 +48,9 @@ def test_d_observation_steps_and_k_action_steps_are_d_plus_k_observation_steps(d
         return np.clip(np.sin(5 * observation[-3:] + t), -1, 1).astype(np.float32)
 
     robot = Robot("Hopper-v5", k, d, seed=1)
-    wrappers = [
-        DelayedObservationWrapper(gym.make("Hopper-v5"), d, k),
-        DelayedObservationWrapper(gym.make("Hopper-v5"), d + k),
-        DelayedObservationWrapper(gym.make("Hopper-v5"), FixedDelay(d), (k, k)),
-    ]
+    delays: list[Any] = [(d, k), (d + k,), (FixedDelay(d), (k, k))]
+    tasks = [gym.make("Hopper-v5", terminate_when_unhealthy=False) for _ in delays]
+    wrappers = [DelayedObservationWrapper(task, *delay) for task, delay in zip(tasks, delays, strict=True)]
     observations = [env.reset(seed=1)[0] for env in wrappers]
     observation = np.asarray(robot.state, np.float32)
     for t in range(15):
@@ -107,7 +106,7 @@ def test_actions_that_take_a_time_each(observation, action, receiver, spare, see
             np.testing.assert_allclose(scale_action(task.actions[-1][-1], env.action_space), info["executed_action"])
             shown = t - back.step()
             np.testing.assert_array_equal(obs["observation"], task.states[-1][shown])
-            newest = arrived_as[shown - 1] if shown > 0 else -1  # that shows in the observation
+            newest = max(arrived_as[:shown], default=-1)  # that shows in the observation
             assert obs["delay"].item() == t - 1 - newest <= process.max_delay
             n_sent = min(t, max_delay)
             newest_sent = np.reshape([scale_action(a, env.action_space) for a in sent[t - n_sent :]], (n_sent, 2))

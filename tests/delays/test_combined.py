@@ -83,6 +83,25 @@ def test_held_delay_updates_at_a_phase_of_its_own_in_each_episode():
     assert set(phases) == {0, 1, 2, 3}
 
 
+class Mixed:
+    """Draws one delay for an episode, or one for each packet."""
+
+    max_delay = 3
+
+    def __init__(self):
+        self.n_asked = 0
+
+    def sample(self, rng):
+        self.n_asked += 1
+        return 1 if self.n_asked == 1 else itertools.repeat(2)
+
+
+def test_actions_are_delayed_always_for_an_episode_or_always_one_by_one():
+    env = DelayedObservationWrapper(LoggedTask(), 1, Mixed())
+    with pytest.raises(ValueError, match="as an action delay a process draws always the one or always the other"):
+        env.reset(seed=0)
+
+
 def test_a_total_that_is_one_for_an_episode_is_drawn_anew_by_what_holds_it():
     held = [
         draw_packets(HeldDelay(process, 0.8), N) for process in ((2, 5), TotalDelay((0, 3), 2), TotalDelay(2, (0, 3)))

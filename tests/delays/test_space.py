@@ -40,6 +40,7 @@ def with_parts(**parts):
         (spaces.Sequence(spaces.Discrete(3)), spaces.Box(-1, 1, (2,)), "of a fixed length"),
         (spaces.Box(-1, 1, (3,)), spaces.Discrete(2), "discrete actions is not supported"),
         (spaces.Box(-1, 1, (3,)), spaces.MultiDiscrete([2, 2]), "discrete actions is not supported"),
+        (spaces.Box(-1, 1, (3,)), spaces.Dict(a=spaces.Box(-1, 1, (2,))), "let the agent see one, with .*TransformA"),
         (spaces.Box(-1, 1, (3,)), spaces.Box(-1, np.inf, (2,)), "must be finite.*TransformAction"),
         (spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (2, 2)), r"1-D Box action.*action\.reshape"),
         (spaces.Box(-1, 1, (0,)), spaces.Box(-1, 1, (2,)), "The observation has no entries"),

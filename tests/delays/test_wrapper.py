@@ -2,6 +2,7 @@
 
 import copy
 from functools import partial
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env as check_gymnasium_env
-from gymnasium.wrappers import RecordVideo
+from gymnasium.wrappers import Autoreset, RecordVideo
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from logged_task import HIGH, LOW, LoggedTask, delay_of_episode
@@ -449,6 +450,47 @@ def test_wrapping_twice_is_refused(between):
     with pytest.raises(ValueError, match=r"already. One wrapper gives every delay") as refused:
         DelayedObservationWrapper(between(DelayedObservationWrapper(LoggedTask(), 1, state_history=True)), 1)
     assert "Flatten" not in str(refused.value)
+
+
+def test_without_an_episode_the_task_is_not_stepped():
+    task = LoggedTask(length=3)
+    env = DelayedObservationWrapper(task, 2)
+    with pytest.raises(gym.error.ResetNeeded, match=r"Call reset\(\) first"):
+        env.step(env.action_space.sample())
+    assert task.actions == []
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(env.action_space.sample())
+    with pytest.raises(gym.error.ResetNeeded, match=r"Autoreset, goes around DelayedObservationWrapper"):
+        env.step(env.action_space.sample())
+    assert len(task.actions[-1]) == 3
+
+
+def test_a_task_that_resets_itself_goes_below_and_is_told():
+    below = DelayedObservationWrapper(Autoreset(LoggedTask(length=3)), 2)
+    above = Autoreset(DelayedObservationWrapper(LoggedTask(length=3), 2))
+    for env in (below, above):
+        env.reset(seed=0)
+        for _ in range(3):
+            env.step(env.action_space.sample())
+    assert above.step(above.action_space.sample())[0]["delay"] == 0
+    with pytest.raises(gym.error.ResetNeeded, match="Autoreset"):
+        below.step(below.action_space.sample())
+
+
+@pytest.mark.parametrize("action", [np.float32([0.5]), 0.5, np.zeros((2, 1), np.float32)])
+def test_an_action_of_another_shape_is_refused(action):
+    env = DelayedObservationWrapper(LoggedTask(), 2)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"The action has the shape .*, expected \(2,\)"):
+        env.step(action)
+
+
+@pytest.mark.parametrize("kwargs", [{}, {"max_delay": 8}])
+def test_the_largest_delay_of_ones_own_process_is_a_whole_number(kwargs):
+    process = SimpleNamespace(max_delay=4.0, sample=lambda rng: 2)
+    with pytest.raises(ValueError, match=r"max_delay of namespace.* is a whole number >= 0, got 4\.0"):
+        DelayedObservationWrapper(LoggedTask(), process, **kwargs)
 
 
 def test_max_delay_below_the_delay_is_refused():

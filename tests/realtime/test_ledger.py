@@ -179,7 +179,10 @@ def test_an_observation_that_is_too_old_discards_the_plan():
     ledger = make(max_age=1)
     ledger.observe([1.0], 0, None)
     ledger.splice(plan(0.1, 0.2, 0.3, 0.4), 0)
+    promised = ledger.request(3)
+    assert promised.era == ledger.era and promised.history[-3:, 0] == pytest.approx([0.05, 0.1, 0.15])  # scaled
     assert send(ledger, 4) == pytest.approx([0.1, 0.2, 0.2, 0.2])
+    assert promised.era != ledger.era  # its answer would follow what was not sent
     assert ledger.request(0) is None
 
 

@@ -3,9 +3,11 @@
 import threading
 import time
 from collections import Counter
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 from recorder import Gated, Planning, Recorder, assert_honest, plan_of
 from small_agent import make
 from small_task import Drift, delayed
@@ -16,6 +18,13 @@ from sb3_said.realtime import ControlLoop, LoopedModel, LoopStatistics, NoAnswer
 
 TASK = Drift()
 ZEROS = np.zeros(2, np.float32)
+
+
+class Sees(Planning):
+    """Plans the number that it sees."""
+
+    def predict_plan(self, observation, deterministic=False):
+        return np.tile(observation["observation"][:, None, :1], (1, 4, 1))
 
 
 def in_steps(model, n=0, **kwargs):
@@ -80,10 +89,68 @@ def test_where_no_observation_comes_the_last_is_asked_about_again_a_step_older()
             loop.wait(60)
             loop.act(t)
         assert loop.wait(60)
-    assert [int(asked["delay"][0]) for asked in model.asked] == [
-        0,
-        2,
-    ]  # not after act(0), which had heard of it; 3 is too old
+    assert [int(asked["delay"][0]) for asked in model.asked] == [0, 1, 2]  # 3 is too old
+
+
+@pytest.mark.parametrize("every", [1, 2, 3])
+@pytest.mark.parametrize("simulate", [None, lambda seconds: 0])
+def test_a_slow_sensor_makes_no_step_go_without_an_answer(every, simulate):
+    """Of a model of one action: the step after an observation is asked for, too."""
+    with ControlLoop(Recorder(TASK, 8), 1, answer_steps=0, simulate=simulate) as loop:
+        loop.reset(now=-1)
+        for t in range(12):
+            if t % every == 0:
+                loop.observe(ZEROS + t, n_executed=t)
+            loop.wait(60)
+            loop.act(t)
+        assert loop.statistics().held_steps == 0
+
+
+def test_an_answer_that_waits_for_an_observation_is_not_asked_for_twice():
+    """A plan goes on where the next observation may come any moment, for which the model is to be idle."""
+    model = Planning(TASK, 4)
+    with ControlLoop(model, 1, answer_steps=0) as loop:
+        model.asked.clear()
+        loop.observe(ZEROS, n_executed=0)
+        loop.wait(60)
+        loop.act(0)
+        assert loop.wait(60) and len(model.asked) == 1
+
+
+@pytest.mark.parametrize("simulate", [None, lambda seconds: 3])
+def test_a_robot_that_was_moved_before_it_starts_begins_with_what_it_saw_last(simulate):
+    with ControlLoop(Sees(TASK, 4), 1, answer_steps=3, simulate=simulate) as loop:
+        loop.reset()
+        for seen in (1.0, 2.0):
+            loop.observe(ZEROS + seen, n_executed=0)
+            assert loop.wait(60)
+        assert [float(loop.act(t)[0]) for t in range(6)] == [2.0] * 6
+
+
+@pytest.mark.parametrize("simulate", [None, lambda seconds: 0])
+def test_what_normalises_in_place_is_given_the_observation_itself_each_time(simulate):
+    def normalize(observation):
+        observation["observation"] -= 5.0
+        return observation
+
+    model = Recorder(TASK, 4)
+    with ControlLoop(model, 1, answer_steps=0, normalize=normalize, simulate=simulate) as loop:
+        model.asked.clear()
+        loop.observe(ZEROS + 25, n_executed=0)
+        for t in range(3):
+            loop.wait(60)
+            loop.act(t)
+    assert {float(asked["observation"][0]) for asked in model.asked} == {20.0} and len(model.asked) >= 3
+
+
+@pytest.mark.parametrize("safe", [-10, 300, 256, np.nan, [1, 2]])
+def test_a_safe_action_that_whole_numbers_cannot_hold_is_refused(safe):
+    task = SimpleNamespace(observation_space=TASK.observation_space, action_space=spaces.Box(0, 255, (1,), np.uint8))
+    model = Recorder(task, 4)
+    with pytest.raises(ValueError, match=r"safe_action is .* expected an action of"):
+        ControlLoop(model, 1, safe_action=np.atleast_1d(np.array(safe)), simulate=lambda seconds: 0)
+    with ControlLoop(model, 1, safe_action=[99.6], simulate=lambda seconds: 0) as loop:
+        assert loop.safe_action.tolist() == [100] and loop.safe_action.dtype == np.uint8
 
 
 def test_a_robot_that_stands_until_the_plan_is_there_begins_with_it():
