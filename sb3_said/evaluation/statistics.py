@@ -205,9 +205,11 @@ def stratified_interval(
     n_seeds, n_episodes = values.shape
     rng = np.random.default_rng(seed)
     means = np.zeros(n_resamples)
-    for _ in range(n_seeds):  # one drawn seed at a time, as all together take gigabytes
-        drawn = rng.integers(n_seeds, size=(n_resamples, 1))
-        means += values[drawn, rng.integers(n_episodes, size=(n_resamples, n_episodes))].mean(1) / n_seeds
+    for _ in range(n_seeds):
+        drawn = rng.integers(n_seeds, size=n_resamples)
+        for part in np.array_split(np.arange(n_resamples), -(-n_resamples // 500)):  # as all together take gigabytes
+            episodes = rng.integers(n_episodes, size=(len(part), n_episodes))
+            means[part] += values[drawn[part, None], episodes].mean(1) / n_seeds
     bounds = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
     value = float(values.mean())
     return Interval(value, *_holding(value, *bounds), confidence, values.size, "stratified bootstrap")

@@ -36,7 +36,6 @@ def write_best(run: Path, folder: Path, planner: dict[str, Any], n_updates: int,
     elif n_updates != record.hyperparams.get("planner_gradient_steps"):
         hyperparams["planner_gradient_steps"] = n_updates
     record = replace(record, hyperparams=hyperparams, options=options)
-    record.write(folder)  # what makes the task of best.zip
     if (statistics := normalization_file(run / record.agent_name)).exists():
         shutil.copyfile(statistics, normalization_file(folder / record.agent_name))  # of all agents there
 
@@ -50,6 +49,7 @@ def write_best(run: Path, folder: Path, planner: dict[str, Any], n_updates: int,
     lines += [f"Left out, as YAML cannot hold it: {name}" for name in left_out]
     text = "".join(f"# {line}\n" for line in lines) + yaml.safe_dump({record.env: block}, sort_keys=False)
     write_text(folder / TUNED_SETTINGS, text)
+    record.write(folder)  # what makes the task of best.zip; last, as without the YAML it is that of a run
     return command
 
 

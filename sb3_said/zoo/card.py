@@ -16,7 +16,7 @@ from huggingface_hub import EvalResult, ModelCard, ModelCardData
 
 from sb3_said import SAID, PlannerConfig
 from sb3_said.delays.space import written_ages
-from sb3_said.files.atomic import check_writable
+from sb3_said.files.atomic import check_writable, write_text
 from sb3_said.files.normalization import normalization_file
 from sb3_said.zoo.arguments import explained, make_parser
 from sb3_said.zoo.cells import Cell, Results, average
@@ -69,8 +69,8 @@ def main(argv: list[str] | None = None) -> None:
         record, results = Record.read(args.run), Results(args.returns, None)
         run = load_run(args.agent, record.algo, record.env, gym_packages=record.gym_packages)
         card = make_card(run, record, results, args.latency, trial_steps(args.run))
-    card.save(target)
-    print(f"Wrote {target}")
+        write_text(target, str(card))
+        print(f"Wrote {target}")
 
 
 def trial_steps(folder: Path) -> int:
@@ -108,7 +108,8 @@ def make_card(
         )
     file = Path(run.info["file"])
     digest = digest_of(run)
-    cells = [cell for cell in results.cells if cell.sha256 == digest and cell.result is not None]
+    known = [cell for cell in results.cells if cell.sha256 == digest and cell.result is not None]
+    cells = [*{cell.key: cell for cell in known}.values()]  # each once, whatever the file was labelled
     who = run.model.policy.who_answers if hasattr(run.model.policy, "who_answers") else None
     answered = [cell for cell in cells if cell.answer == who and not cell.age_error]
     if not answered:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -155,18 +156,42 @@ def _moved(path: str, to: Path, within: Path = Path()) -> str:
 def make_table(cells: list[Cell], rows: Mapping[str, str]) -> Table:
     """Return what each row's agent returned under each delay that it could play.
 
-    Several cells of one agent and one delay are of several training seeds.
+    Several cells of one agent and one delay are of several training seeds, in the same order under each delay.
 
     :param rows: agents, each with the name that the table shows
     """
-    played: dict[str, dict[int | str, list[list[float]]]] = {agent: {} for agent in rows}
-    for cell in cells:
-        if cell.agent in played and (result := cell.result) is not None:
-            played[cell.agent].setdefault(cell.column, []).append(result["returns"])
     return {
-        rows[agent]: {delay: np.array(seeds if len(seeds) > 1 else seeds[0]) for delay, seeds in row.items()}
-        for agent, row in played.items()
+        rows[agent]: {
+            column: np.array([*seeds.values()] if len(seeds) > 1 else next(iter(seeds.values())))
+            for column, seeds in row.items()
+        }
+        for agent, row in _by_seed(cells, rows).items()
     }
+
+
+def unpaired(cells: list[Cell], rows: Mapping[str, str]) -> set[str]:
+    """Return the rows of which two delays share some of their training seeds and not all, by the names shown.
+
+    An average over delays would be of other seeds under each.
+
+    :param rows: as of :func:`make_table`
+    """
+    return {
+        rows[agent]
+        for agent, row in _by_seed(cells, rows).items()
+        for one, other in combinations(row.values(), 2)
+        if one.keys() != other.keys() and one.keys() & other.keys()
+    }
+
+
+def _by_seed(cells: list[Cell], rows: Mapping[str, str]) -> dict[str, dict[int | str, dict[str, list[float]]]]:
+    """Return the returns of each agent under each delay by what tells a training seed, in one order of these."""
+    order = {sha256: i for i, sha256 in enumerate(dict.fromkeys(cell.sha256 for cell in cells))}
+    played: dict[str, dict[int | str, dict[str, list[float]]]] = {agent: {} for agent in rows}
+    for cell in sorted(cells, key=lambda cell: order[cell.sha256]):
+        if cell.agent in played and (result := cell.result) is not None:
+            played[cell.agent].setdefault(cell.column, {})[cell.sha256] = result["returns"]
+    return played
 
 
 class Manners(NamedTuple):
@@ -211,18 +236,22 @@ def print_manners(cells: list[Cell], rows: Mapping[str, str]) -> None:
             print(", ".join(words))
 
 
-def print_table(table: Table, delays: list[int | str]) -> None:
+def print_table(table: Table, delays: list[int | str], unpaired: Collection[str] = ()) -> None:
     """Print a Markdown table: one row for each agent, one column for each delay, then the averages.
 
     Ages that are told wrong have columns of their own and count in no average. A line below it says what the intervals
     are over.
+
+    :param unpaired: rows whose averages have no interval
     """
     columns = _columns(delays)
-    _print_rows("return under delay", table, columns, confidence_interval)
+    _print_rows("return under delay", table, columns, confidence_interval, unpaired)
     several = {agent: row for agent, row in table.items() if row and all(x.ndim == 2 for x in row.values())}
     if several:
-        print("\nThe same agents, with episodes drawn within training seeds:")
-        _print_rows("return under delay", several, columns, stratified_interval)
+        print("\nThe same agents, with training seeds drawn, and then episodes of each:")
+        _print_rows("return under delay", several, columns, stratified_interval, unpaired)
+    if told := [row for row in table if row in unpaired]:
+        print(f"{', '.join(told)}: no interval of the means, as some delays have other training seeds than others.")
 
 
 def print_seeds(cells: Iterable[Cell], rows: Mapping[str, str]) -> None:
@@ -236,7 +265,7 @@ def print_seeds(cells: Iterable[Cell], rows: Mapping[str, str]) -> None:
             print(f"{name}: {len(files)} agents, {', '.join(files)}")
 
 
-def print_scores(table: Table, delays: list[int | str], env_id: str) -> None:
+def print_scores(table: Table, delays: list[int | str], env_id: str, unpaired: Collection[str] = ()) -> None:
     """Print the table again in D4RL's normalised scores, and nothing for no rows or a task that has none."""
     if table and reference_returns(env_id) is not None:
         scores = {
@@ -244,7 +273,7 @@ def print_scores(table: Table, delays: list[int | str], env_id: str) -> None:
             for row, returns in table.items()
         }
         print()
-        _print_rows("normalised score", scores, _columns(delays), confidence_interval)
+        _print_rows("normalised score", scores, _columns(delays), confidence_interval, unpaired)
 
 
 def _columns(delays: list[int | str]) -> dict[str, list[int | str]]:
@@ -256,9 +285,16 @@ def _columns(delays: list[int | str]) -> dict[str, list[int | str]]:
 
 
 def _print_rows(
-    what: str, table: Table, columns: dict[str, list[int | str]], interval: Callable[[Any], Interval]
+    what: str,
+    table: Table,
+    columns: dict[str, list[int | str]],
+    interval: Callable[[Any], Interval],
+    unpaired: Collection[str],
 ) -> None:
-    averages = {agent: [average(row, column, interval) for column in columns.values()] for agent, row in table.items()}
+    averages = {
+        agent: [average(row, column, interval, agent not in unpaired) for column in columns.values()]
+        for agent, row in table.items()
+    }
     rows = [[what, *columns]]
     rows += [[agent, *(text for text, _ in row)] for agent, row in averages.items()]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -274,6 +310,7 @@ def average(
     row: Mapping[int | str, np.ndarray],
     delays: list[int | str],
     interval: Callable[[Any], Interval] = confidence_interval,
+    is_paired: bool = True,
 ) -> tuple[str, str]:
     """Write the mean return over delays with its interval, and what that is over: training seeds, or reset seeds.
 
@@ -281,13 +318,17 @@ def average(
     :param delays: those that the agent cannot play are left out, and the rest is counted. Delays of different numbers
         of training seeds have a mean and no interval
     :param interval: of returns (n_episodes,), or (n_seeds, n_episodes) of several training seeds
+    :param is_paired: whether the delays have the same training seeds; else several have a mean and no interval, too
     """
     returns = [row[delay] for delay in delays if delay in row]
     if not returns:
         return "-", ""
     covered = "" if len(returns) == len(delays) else f", {len(returns)} of {len(delays)}"
-    if len({one.shape for one in returns}) > 1:
+    if len({one.shape for one in returns}) > 1 or not (is_paired or len(returns) == 1):
         return f"{np.mean([one.mean() for one in returns]):.1f}{covered}", ""
     found = interval(np.mean(returns, axis=0))  # from (delays, n_episodes) or (delays, seeds, n_episodes)
-    units = "training seeds" if returns[0].ndim == 2 and interval is confidence_interval else "episodes"
-    return f"{found}{covered}", f"{found.n} {units} ({found.method})"
+    units = f"{found.n} episodes"
+    if returns[0].ndim == 2:
+        n_seeds, n_episodes = returns[0].shape
+        units = f"{n_seeds} training seeds" + f" of {n_episodes} episodes" * (interval is not confidence_interval)
+    return f"{found}{covered}", f"{units} ({found.method})"

@@ -92,21 +92,24 @@ def main(argv: list[str] | None = None) -> None:
             let_answer(model, args.answer or model.policy.who_answers, *expert_ages)
         if args.output is not None:
             check_target(args.output)
-    config = model.policy.planner.config
-    for name in SAMPLING_SETTINGS:
-        print(f"{name:14} {getattr(config, name)}" + "  (new)" * (name in settings))
-    if config.decided_by == "actor":
-        print(
-            "The expert acts on the guessed present, and nothing is planned: the settings above present change nothing."
-        )
-    elif config.temperature == 0:
-        print("At temperature 0 there is one candidate: n_candidates, scored_states and choice_factor change nothing.")
-    if not model.policy.planner_is_trained:
-        print("The planner of this agent is not trained yet.")
-    who, ages = model.policy.who_answers, written_ages([*model.policy.expert_ages])
-    print(f"{'answers':14} {who}{f': the expert at ages {ages}' * (who == 'both')}{'  (new)' * sets_answer}")
-    if args.output is not None:
-        hand_on(model, args.agent, args.output, args.compact)
+        config = model.policy.planner.config
+        for name in SAMPLING_SETTINGS:
+            print(f"{name:14} {getattr(config, name)}" + "  (new)" * (name in settings))
+        if config.decided_by == "actor":
+            print(
+                "The expert acts on the guessed present, and nothing is planned: the settings above present change "
+                "nothing."
+            )
+        elif config.temperature == 0:
+            print(
+                "At temperature 0 there is one candidate: n_candidates, scored_states and choice_factor change nothing."
+            )
+        if not model.policy.planner_is_trained:
+            print("The planner of this agent is not trained yet.")
+        who, ages = model.policy.who_answers, written_ages([*model.policy.expert_ages])
+        print(f"{'answers':14} {who}{f': the expert at ages {ages}' * (who == 'both')}{'  (new)' * sets_answer}")
+        if args.output is not None:
+            hand_on(model, args.agent, args.output, args.compact)
 
 
 def let_answer(model: SAID, who: Answer, up_to: int | None, since: int | None) -> None:
@@ -140,9 +143,9 @@ def hand_on(model: SAID, agent: Path, output: Path, compact: bool) -> None:
     :param agent: the run's folder, or the file that it was opened from
     :param output: where to save it
     """
-    keep_normalization(agent, output)
     model.save(output, compact=compact)
     print(f"Wrote {output}")
+    keep_normalization(agent, output)
     record = find_agent(agent)[1]
     changed = {} if record is None else changes(record.env_kwargs, record.wrappers)
     if changed and find_agent(output)[1] != record:

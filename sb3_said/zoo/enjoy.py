@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
-from contextlib import closing, nullcontext
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, nullcontext
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -74,7 +76,9 @@ class Video:
         """
         rate = env.metadata.get("render_fps") or self.fps  # control steps a second
         self.fps = min(self.fps, rate)
-        due = self._steps * self.fps / rate
+        if self.path.suffix == ".gif":  # which counts in hundredths of a second
+            self.fps = 100 / math.ceil(100 / self.fps - 1e-9)
+        due = self._steps * self.fps / rate + 1e-9
         self._steps += 1
         if due < self.frames:
             return
@@ -160,17 +164,26 @@ def check_can_record(path: Path) -> None:
 
     :raises ValueError: for a file that is no video, and a folder
     :raises OSError: where the file cannot be written
-    :raises ImportError: without imageio, or when MuJoCo cannot load the library that MUJOCO_GL names
+    :raises ImportError: without imageio
     """
     if path.suffix not in (".mp4", ".gif"):
         raise ValueError(f"--record takes a file ending in .mp4 or .gif, got {path}.")
     if any(find_spec(package) is None for package in ("imageio", "imageio_ffmpeg")):
         raise ImportError('Videos need imageio and imageio-ffmpeg: pip install "sb3_said[video]"')
-    try:
-        import mujoco  # noqa: F401  # loads the GL library
-    except Exception as error:
-        raise CannotDraw(error) from error
     check_writable(path)
+
+
+@contextmanager
+def naming_libraries() -> Iterator[None]:
+    """Say what to install where a task of MuJoCo cannot be made, as the library that MUJOCO_GL names is not there."""
+    try:
+        yield
+    except (ImportError, AttributeError, OSError) as error:
+        try:
+            import mujoco  # noqa: F401  # loads it
+        except Exception as cause:
+            raise CannotDraw(cause) from error
+        raise
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -201,7 +214,8 @@ def main(argv: list[str] | None = None) -> None:
         if args.size is not None:
             drawn |= {"width": args.size, "height": args.size}
         played = args.algo, args.env, read_delay(args.delay), args.device, drawn, args.gym_packages
-        run = load_run(args.run, *played, answer=args.answer)
+        with naming_libraries() if video else nullcontext():
+            run = load_run(args.run, *played, answer=args.answer)
         if args.beside_ignorant and not longest_delay(run.model):
             raise ValueError(f"--beside-ignorant needs an agent that is told an age; {args.run} knows no delay.")
         with answering(run.model, args.answer), closing(video) if video else nullcontext():

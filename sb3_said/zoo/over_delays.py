@@ -28,7 +28,17 @@ from sb3_said.delays.text import age_range, make_process
 from sb3_said.evaluation import Summary, plots
 from sb3_said.files.atomic import check_writable
 from sb3_said.zoo.arguments import TRUST, add_playing, check_positive, explained, make_parser, read_delay
-from sb3_said.zoo.cells import AGE, Cell, Results, make_table, print_manners, print_scores, print_seeds, print_table
+from sb3_said.zoo.cells import (
+    AGE,
+    Cell,
+    Results,
+    make_table,
+    print_manners,
+    print_scores,
+    print_seeds,
+    print_table,
+    unpaired,
+)
 from sb3_said.zoo.runs import ANSWERS, LoadedRun, answers, delay_name, load_run, longest_delay, origin
 from sb3_said.zoo.stopping import holding_back_ctrl_c, shield
 
@@ -97,22 +107,23 @@ def main(argv: list[str] | None = None) -> None:
         shown = play_missing(args, delays) if args.runs else known_cells(args, delays)
         shown = [replace(cell, delay=named.setdefault(repr(make_process(cell.delay)), cell.delay)) for cell in shown]
         rows = choose_rows(args.rows, shown)
-    table = make_table(shown, rows)
-    order = delays or list(dict.fromkeys(cell.delay for cell in shown))
-    in_order = sorted(shown, key=lambda cell: (cell.age_error != 0, order.index(cell.delay), cell.age_error))
-    columns, settings = list(dict.fromkeys(cell.column for cell in in_order)), Results(args.json).settings
-    print_table(table, columns)
-    print_seeds(shown, rows)
-    changed = {rows[cell.agent] for cell in shown if cell.is_changed and cell.agent in rows}
-    print_scores({row: x for row, x in table.items() if row not in changed}, columns, settings["env"])
-    print_manners(shown, rows)
-    if args.plot is not None and not any(table.values()):
-        print(f"Nothing was played that {args.plot} could show.")
-    elif args.plot is not None:
-        title = f"{settings['env']} under delay: means of {settings['n_episodes']} episodes, 95 % intervals"
-        told_right = {row: {c: x for c, x in of_row.items() if AGE not in str(c)} for row, of_row in table.items()}
-        plots.save(plots.plot_over_delays(told_right, title)[0], args.plot)
-        print(f"Wrote {args.plot}")
+        table = make_table(shown, rows)
+        order = delays or list(dict.fromkeys(cell.delay for cell in shown))
+        in_order = sorted(shown, key=lambda cell: (cell.age_error != 0, order.index(cell.delay), cell.age_error))
+        columns, settings = list(dict.fromkeys(cell.column for cell in in_order)), Results(args.json).settings
+        others = unpaired(shown, rows)
+        print_table(table, columns, others)
+        print_seeds(shown, rows)
+        changed = {rows[cell.agent] for cell in shown if cell.is_changed and cell.agent in rows}
+        print_scores({row: x for row, x in table.items() if row not in changed}, columns, settings["env"], others)
+        print_manners(shown, rows)
+        if args.plot is not None and not any(table.values()):
+            print(f"Nothing was played that {args.plot} could show.")
+        elif args.plot is not None:
+            title = f"{settings['env']} under delay: means of {settings['n_episodes']} episodes, 95 % intervals"
+            told_right = {row: {c: x for c, x in of_row.items() if AGE not in str(c)} for row, of_row in table.items()}
+            plots.save(plots.plot_over_delays(told_right, title)[0], args.plot)
+            print(f"Wrote {args.plot}")
 
 
 def read_name(word: str) -> int | str:
@@ -192,6 +203,9 @@ def play_missing(args: argparse.Namespace, delays: list[int | str]) -> list[Cell
             if args.answer
             else f"There is nothing to play: no run is of the delays {', '.join(map(str, delays))}."
         )
+    for row, n in Counter(row for row, _ in {(cell.agent, cell.lineage[1]) for cell in cells}).items():
+        if n > 1:
+            raise ValueError(f"Agents of two labels would both be the row {row!r}: give one another label.")
     choose_rows(args.rows, cells)
     for (file, label), n in Counter(cell.lineage for cell in results.ask(cells)).items():
         print(f"{n} results of {label} are dropped: {file} has changed since.")
@@ -227,6 +241,8 @@ def open_runs(args: argparse.Namespace) -> dict[str, list[LoadedRun]]:
     runs: dict[str, list[LoadedRun]] = {}
     for text in args.runs:
         given, path = re.fullmatch(r"(?:([^=/]+)=)?(.*)", text, re.DOTALL).groups()  # type: ignore[union-attr]  # fits all
+        if given and Path(text).exists():  # a folder such as lr=0.1
+            given, path = None, text
         label = given or "/".join(Path(path).absolute().parts[-2:]).removesuffix(".zip")
         with at_any_age():
             run = load_run(path, args.algo, args.env, None, args.device, gym_packages=args.gym_packages)
@@ -267,9 +283,13 @@ def at_any_age() -> Iterator[None]:
 
 
 def digest_of(run: LoadedRun) -> str:
-    """Return the SHA-256 of an agent's file, and of what its run changes in the task but its delay, if anything."""
+    """Return the SHA-256 of an agent's file, and of what else decides what it sees, if anything.
+
+    That is what its run changes in the task but its delay, and the statistics of ``VecNormalize``.
+    """
     changes = run.setting.encode() if run.changes else b""
-    return hashlib.sha256(Path(run.info["file"]).read_bytes() + changes).hexdigest()
+    statistics = b"" if run.statistics is None else run.statistics.read_bytes()
+    return hashlib.sha256(Path(run.info["file"]).read_bytes() + changes + statistics).hexdigest()
 
 
 def cells_of(

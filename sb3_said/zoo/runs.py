@@ -60,6 +60,8 @@ class LoadedRun:
     changes: dict[str, Any] = field(default_factory=dict)
     """what its run changes in the task but the observation delay: arguments of ours, and those of other wrappers and of
     ``gymnasium.make`` by their names"""
+    statistics: Path | None = None
+    """file of what ``normalize`` does"""
     own_delay: DelayProcess | None = None
     """of a task that is registered with one, and can be played under no other"""
 
@@ -179,8 +181,9 @@ def load_run(
     info = {"algo": algo, "env": env_id, "delay": delay_name(delay_process)}
     info |= {"file": str(file), "trained_steps": model.num_timesteps}
     is_normalized = bool(hyperparams.get("normalize")) or getattr(model, "reads_normalized", False)
-    normalize = _load_normalize(file, record, make_env, is_normalized)
-    return LoadedRun(model, make_env, normalize, file.parent, info, changes(kwargs, wrappers), own_delay)
+    statistics = find_normalization(file, record)
+    normalize = _load_normalize(file, statistics, make_env, is_normalized)
+    return LoadedRun(model, make_env, normalize, file.parent, info, changes(kwargs, wrappers), statistics, own_delay)
 
 
 def _warn_if_unfinished(model: BaseAlgorithm, file: Path, record: Record | None) -> None:
@@ -328,9 +331,8 @@ def _check_spaces(model: BaseAlgorithm, env: gym.Env[Any, Any], file: Path) -> N
 
 
 def _load_normalize(
-    file: Path, record: Record | None, make_env: Callable[[], gym.Env[Any, Any]], is_needed: bool
+    file: Path, found: Path | None, make_env: Callable[[], gym.Env[Any, Any]], is_needed: bool
 ) -> Callable[[Observation], Observation] | None:
-    found = find_normalization(file, record)
     if found is None:
         if is_needed:
             raise ValueError(

@@ -180,6 +180,8 @@ def open_study(
             storage=backend, study_name=name, direction="maximize", load_if_exists=True, pruner=pruner
         )
         if "settings" not in study.user_attrs:
+            if study.get_trials(deepcopy=False) or study.direction != optuna.study.StudyDirection.MAXIMIZE:
+                raise ValueError(f"Study {name!r} in {storage} is of something else: give another --study-name.")
             study.set_user_attr("settings", settings)
     advice = "Go on with the old ones, or begin another study with --study-name."
     check_same(f"Study {name!r} in {storage} was begun", study.user_attrs["settings"], settings, advice)
@@ -200,7 +202,7 @@ def _open_storage(storage: str) -> BaseStorage:
     patience = {"connect_args": {"timeout": 120}} if storage.startswith("sqlite") else {}
     try:
         return RDBStorage(storage, engine_kwargs=patience)
-    except SQLAlchemyError as error:
+    except (SQLAlchemyError, RuntimeError) as error:  # the second where it is of another version of Optuna
         raise ValueError(f"--storage {storage} cannot be opened: {str(error).splitlines()[0]}") from error
 
 

@@ -72,6 +72,16 @@ def test_returns_of_another_file_are_refused(run: Path, tmp_path: Path, capsys: 
     assert f"{told} --episodes 2 --seed 10000 --json {returns} first" in capsys.readouterr().err
 
 
+def test_returns_of_a_file_with_two_labels_count_once(run: Path, tmp_path: Path) -> None:
+    returns = tmp_path / "returns.json"
+    how = ["--episodes", "3", "--device", "cpu", "--json", str(returns)]
+    over_delays.main([f"a={run}", "--delays", "0", *how])
+    over_delays.main([f"b={run}", "--delays", "0", "2", *how])
+    target = tmp_path / "agent.md"
+    card.main([str(run / f"{ENV}.zip"), "--run", str(run), "--returns", str(returns), "-o", str(target)])
+    assert ModelCard.load(target).data.eval_results[0].metric_name == "mean_reward, observation delays 0, 2"
+
+
 def test_a_file_of_something_else_is_no_card_to_replace(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

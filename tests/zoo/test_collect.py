@@ -179,7 +179,9 @@ def test_bounds_may_be_farther_apart_than_their_type_holds() -> None:
     assert np.isfinite(NoisyAgent(None, space, 0.0, 0).predict(np.zeros((100, 1)))[0]).all()
 
 
-def test_an_agent_of_sb3_goes_into_minari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_agent_of_sb3_goes_into_minari(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     minari = pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     SAC("MlpPolicy", ENV, buffer_size=10, device="cpu", seed=0).save(tmp_path / "sac.zip")
@@ -193,8 +195,10 @@ def test_an_agent_of_sb3_goes_into_minari(tmp_path: Path, monkeypatch: pytest.Mo
     spec = minari.load_dataset("mine/pendulum-v0").spec
     assert (spec.env_spec.id, spec.env_spec.max_episode_steps) == (ENV, gym.spec(ENV).max_episode_steps)
     assert json.loads(minari.load_dataset("mine/pendulum-v0").storage.metadata["description"])
+    capsys.readouterr()
     with pytest.raises(SystemExit):
         collect.main([*words, "-o", "mine/pendulum-v0"])
+    assert "mine/pendulum-v0" in (told := capsys.readouterr().err) and "there already" in told
 
 
 @pytest.mark.parametrize("place", ["vecnormalize.pkl", f"{ENV}/vecnormalize.pkl", None])

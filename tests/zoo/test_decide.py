@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 from dataclasses import replace
@@ -102,6 +103,23 @@ def test_statistics_of_vec_normalize_go_with_the_file(run: Path, tmp_path: Path)
     assert normalization_file(source).read_bytes() == statistics
     decide.main([str(run), "--compact", "-o", str(source)])  # another agent takes the name, and has none
     assert not normalization_file(source).exists()
+
+
+def test_an_agent_that_cannot_be_written_leaves_the_one_before_with_its_statistics(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = tmp_path / "agent.zip"
+    decide.main([str(run), "--compact", "-o", str(target)])
+    normalization_file(target).write_bytes(b"its own")
+
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(SAID, "save", full)
+    with pytest.raises(SystemExit) as stop:
+        decide.main([str(run), "--compact", "-o", str(target)])
+    assert stop.value.code == 1 and "No space left" in capsys.readouterr().err
+    assert normalization_file(target).read_bytes() == b"its own"
 
 
 def test_what_a_run_changes_in_its_task_is_told_where_the_file_leaves_it(

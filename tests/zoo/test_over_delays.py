@@ -24,12 +24,14 @@ pytest.importorskip("rl_zoo3")
 
 from scipy.stats import ttest_1samp
 from small_run import ENV, write_run
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.evaluation import Summary
+from sb3_said.files.normalization import normalization_file, save_normalization
 from sb3_said.offline.scores import REFERENCE_RETURNS
 from sb3_said.zoo import evaluate, over_delays
-from sb3_said.zoo.cells import Cell, Results, average, manners_of, print_scores
+from sb3_said.zoo.cells import Cell, Results, average, make_table, manners_of, print_scores, print_table, unpaired
 from sb3_said.zoo.record import Record
 from sb3_said.zoo.runs import load_run
 
@@ -497,7 +499,7 @@ def test_training_seeds_of_one_label_are_one_row(
     out = capsys.readouterr().out
     rows = {
         line.split("|")[1].strip(): line.split("|")[2:-1]
-        for line in out.partition("The same agents, with episodes drawn")[0].splitlines()
+        for line in out.partition("The same agents, with training seeds drawn")[0].splitlines()
         if line.startswith("| ") and "---" not in line
     }
     assert [*rows] == ["return under delay", "three seeds", "one"]
@@ -513,7 +515,7 @@ def test_training_seeds_of_one_label_are_one_row(
         t = ttest_1samp(means, 0.0).confidence_interval()
         assert rows["three seeds"][column].strip() == f"{np.mean(means):.1f} [{t.low:.1f}, {t.high:.1f}]"
     assert "95 % intervals over 3 training seeds (Student's t), or 3 episodes (Student's t)" in out
-    assert "95 % intervals over 9 episodes (stratified bootstrap)" in out
+    assert "95 % intervals over 3 training seeds of 3 episodes (stratified bootstrap)" in out
     assert f"three seeds: 3 agents, {', '.join(dict.fromkeys(one for one, _ in returns))}" in out
     assert "one: 1 agents" not in out
     assert titles == [f"{ENV} under delay: means of 3 episodes, 95 % intervals"]
@@ -554,6 +556,76 @@ def test_an_average_pairs_training_seeds_where_all_delays_have_as_many() -> None
     row = {0: np.array([[1.0, 3.0], [5.0, 7.0]]), 4: np.array([[5.0, 7.0], [1.0, 3.0]]), 8: np.array([9.0, 9.0])}
     assert average(row, [0, 4]) == ("4.0 [4.0, 4.0]", "2 training seeds (Student's t)")
     assert average(row, [0, 8]) == ("6.5", "")
+    assert average(row, [0, 4], is_paired=False) == ("4.0", "")
+    assert average(row, [4], is_paired=False) == average(row, [4])
+
+
+def seeds_of_a_row(played: dict[int, dict[str, float]]) -> list[Cell]:
+    """Return cells of one agent, two episodes each: by delay, what each training seed returned."""
+    settings: dict[str, Any] = {"answer": None, "algo": "sadr", "trained_steps": 1, "obstacle": None}
+    return [
+        Cell(agent="x", delay=delay, file=f"{seed}.zip", sha256=seed, **settings, result={"returns": [x - 1, x + 1]})
+        for delay, seeds in played.items()
+        for seed, x in seeds.items()
+    ]
+
+
+def test_an_average_pairs_a_training_seed_with_itself_however_the_calls_named_them() -> None:
+    right = {0: {"a": 10.0, "b": 20.0, "c": 30.0}, 4: {"a": 110.0, "b": 120.0, "c": 130.0}}
+    swapped = {0: right[0], 4: dict(reversed(right[4].items()))}
+    one, other = (make_table(seeds_of_a_row(played), {"x": "x"})["x"] for played in (right, swapped))
+    assert average(one, [0, 4]) == average(other, [0, 4])
+    t = ttest_1samp([60.0, 70.0, 80.0], 0.0).confidence_interval()
+    assert average(other, [0, 4])[0] == f"70.0 [{t.low:.1f}, {t.high:.1f}]"
+    assert not unpaired(seeds_of_a_row(swapped), {"x": "x"})
+
+
+@pytest.mark.parametrize(
+    ("played", "is_told"),
+    [
+        ({0: {"a": 1.0, "b": 2.0}, 4: {"b": 2.0, "c": 3.0}}, True),
+        ({0: {"a": 1.0, "b": 2.0}, 4: {"b": 2.0}}, True),
+        ({0: {"a": 1.0}, 4: {"b": 2.0}}, False),  # an agent for each delay
+    ],
+)
+def test_delays_of_other_training_seeds_have_no_interval_together(
+    played: dict[int, dict[str, float]], is_told: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cells = seeds_of_a_row(played)
+    others = unpaired(cells, {"x": "y"})
+    assert others == ({"y"} if is_told else set())
+    print_table(make_table(cells, {"x": "y"}), [0, 4], others)
+    out = capsys.readouterr().out
+    mean = next(line for line in out.splitlines() if line.startswith("| y ")).split("|")[4].strip()
+    assert ("[" not in mean) == is_told == ("y: no interval of the means, as some delays" in out)
+
+
+def test_other_statistics_of_vec_normalize_make_another_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = write_run(tmp_path / "run", DelayedSAC, 1)
+    env = VecNormalize(DummyVecEnv([lambda: DelayedObservationWrapper(gym.make(ENV), 1)]), norm_obs=False)
+    agent = run / f"{ENV}.zip"
+    played = count_plays(monkeypatch)
+    play(tmp_path / "out.json", [f"x={run}"], ["1"])
+    save_normalization(normalization_file(agent), env)
+    for _ in range(2):
+        play(tmp_path / "out.json", [f"x={run}"], ["1"])
+    env.ret_rms.mean += 1.0
+    save_normalization(normalization_file(agent), env)
+    document = play(tmp_path / "out.json", [f"x={run}"], ["1"])
+    assert len(played) == 3 and len(document["cells"]) == 1
+
+
+def test_a_path_with_an_equals_sign_is_no_label(sadr: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(sadr, Path("lr=0.1") / "s0")
+    document = play(tmp_path / "out.json", ["lr=0.1/s0", "x=lr=0.1/s0"], ["1"])
+    assert [cell["agent"] for cell in document["cells"]] == ["lr=0.1/s0", "x"]
+
+
+def test_rows_of_two_labels_are_two(said: Path, sadr: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        play(tmp_path / "out.json", [f"x={said}", f"x planner={sadr}"], ["1"])
+    assert "Agents of two labels would both be the row 'x planner'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

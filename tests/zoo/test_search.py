@@ -16,6 +16,7 @@ from gymnasium.wrappers import TransformReward
 pytest.importorskip("rl_zoo3")
 pytest.importorskip("scipy")
 
+import optuna
 from optuna import Study
 from optuna.trial import TrialState
 
@@ -209,3 +210,23 @@ def test_a_study_begun_otherwise_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"settings: episodes was 2 and is now 3; n_candidates .* --study-name"):
         open_study(tmp_path, storage, "test", {**settings, "episodes": 3, "n_candidates": 4}, 0.0)
     open_study(tmp_path, storage, "other", {**settings, "episodes": 3}, 0.0)
+
+
+@pytest.mark.parametrize("direction", ["minimize", "maximize"])
+def test_a_study_of_something_else_is_refused_and_stays(direction: str, tmp_path: Path) -> None:
+    storage = f"sqlite:///{tmp_path / 'studies.db'}"
+    theirs = optuna.create_study(storage=storage, study_name="run", direction=direction)
+    if direction == "maximize":
+        theirs.optimize(lambda trial: trial.suggest_float("lr", 0, 1), n_trials=1)
+    with pytest.raises(ValueError, match=r"Study 'run' in sqlite.* is of something else: give another --study-name"):
+        open_study(tmp_path, storage, "run", {"episodes": 2}, 0.0)
+    assert not optuna.load_study(storage=storage, study_name="run").user_attrs
+
+
+def test_a_data_base_of_another_version_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def other(*_: Any, **__: Any) -> None:
+        raise RuntimeError("The runtime optuna version 4.0 is no longer compatible with the table schema")
+
+    monkeypatch.setattr(search_module, "RDBStorage", other)
+    with pytest.raises(ValueError, match=r"cannot be opened: The runtime optuna version"):
+        open_study(tmp_path, "sqlite:///x.db", "run", {}, 0.0)

@@ -235,11 +235,14 @@ def test_evaluate_has_scores_and_the_best_agent_beside_the_last(
     assert evaluate.score_of(evaluate.Summary.from_episodes("x", [1.0, 2.0], [1, 1]), "Pendulum-v1") is None
 
 
-def test_tune_trains_depths_on_the_same_logs(finished: tuple[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tune_trains_depths_on_the_same_logs(
+    finished: tuple[str, Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     algo, run = finished
     if algo == "bc":
         with pytest.raises(SystemExit):
             tune.main([str(run)])
+        assert "is a run of 'bc', which has no planner" in capsys.readouterr().err
         return
     monkeypatch.setattr(IQL, "step", lambda _: pytest.fail("V is the run's"))
     quick = "--depths 2 --temperatures 0.5 --sampling-steps 1 --episodes 2 --round 2 --report-episodes 2".split()

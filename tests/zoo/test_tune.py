@@ -8,6 +8,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch as th
@@ -24,6 +25,7 @@ from sb3_said import SAID, PlannerConfig
 from sb3_said.files.archive import load_tree
 from sb3_said.files.checkpoint import CHECKPOINT_NAME
 from sb3_said.planner.config import SAMPLING_SETTINGS
+from sb3_said.zoo import best as best_module
 from sb3_said.zoo import train, tune
 from sb3_said.zoo.arguments import read_delay
 from sb3_said.zoo.best import plain_settings, write_best
@@ -115,6 +117,19 @@ def test_a_search_from_grid_to_report(
     tune.main([str(renamed), *command[1:]])
     assert not seeds and "4 trials are finished" in capsys.readouterr().out
     renamed.rename(run)
+
+    # A report that is interrupted leaves a folder that the same command goes on in.
+    for name in ("best.yml", "run.json", "results.json"):
+        (run / "tune" / name).unlink()
+    with monkeypatch.context() as patch:
+        patch.setattr(best_module, "write_text", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(SystemExit) as stop:
+            tune.main(command)
+        assert stop.value.code == 130
+    tune.main(command)
+    again = results_of(run)["report"]["results"]
+    assert [row["returns"] for row in again] == [row["returns"] for row in results["report"]["results"]]
+    capsys.readouterr()
 
     # A training reads the winner.
     best = run / "tune" / "best.yml"
