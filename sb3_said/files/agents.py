@@ -170,7 +170,9 @@ class SafeSaveMixin(OffPolicyAlgorithm):
                 f"The given policy_kwargs {kwargs['policy_kwargs']} differ from {stored} in the file, which the saved"
                 " networks were built with. Leave them out of the call."
             )
-        others = ", ".join(f"{name}={value!r}" for name, value in replaced(arguments, kwargs).items())
+        for name, value in kwargs.items():
+            cls._check_argument(name, value, policy_class)  # no fault of the file
+        others = replaced(arguments, kwargs)
         arguments = with_given(arguments, kwargs, cls.settings_arguments)
         policy = arguments.pop("policy_class", cls.policy_aliases["MlpPolicy"])
         with readable(path, explained=(ValueError, AssertionError)):  # SB3 asserts what it needs of an environment
@@ -188,9 +190,10 @@ class SafeSaveMixin(OffPolicyAlgorithm):
                 model._setup_model()
             model._check_file(saved)
             try:
-                restore_agent(model, saved)
+                restore_agent(model, model._adapt_saved(saved, {*given, *others}))
             except SavedFileError as error:
-                remedy = f"; it was saved with {others}: leave out of the call what its networks depend on"
+                told = ", ".join(f"{name}={value!r}" for name, value in others.items())
+                remedy = f"; it was saved with {told}: leave out of the call what its networks depend on"
                 raise SavedFileError(f"{error}{remedy if others else ''}") from error
             metadata = load_metadata(path)
             model.task, model.reads_normalized = task_of(metadata), metadata["metadata"].get("reads_normalized") is True
@@ -254,10 +257,23 @@ class SafeSaveMixin(OffPolicyAlgorithm):
             raise TypeError(f"{cls.__name__} has no argument {unknown}; {instead_of(unknown, names)}")
 
     def _check_file(self, saved: dict[str, Any]) -> None:
-        """Look at a file whose parameters are about to be taken over; an algorithm may refuse it.
+        """Look at a file whose parameters are about to be taken over; an algorithm may refuse more.
 
-        :raises ValueError: for one that does not go with this agent
+        :raises ValueError: for one that does not go with this agent, such as of networks with another activation
         """
+
+        def computes(policy_kwargs: dict[str, Any] | None) -> dict[str, Any]:
+            of_shapes = ("net_arch", "optimizer_class", "optimizer_kwargs")  # or of no answer
+            return {name: value for name, value in (policy_kwargs or {}).items() if name not in of_shapes}
+
+        given = saved.get("arguments", {}).get("policy_kwargs", self.policy_kwargs)  # a checkpoint has no arguments
+        theirs, own = computes(from_data(given)), computes(self.policy_kwargs)
+        if repr(theirs) != repr(own):
+            raise ValueError(f"its policy_kwargs are {theirs}, and this agent's {own}; make it with the same")
+
+    def _adapt_saved(self, saved: dict[str, Any], changed: set[str]) -> dict[str, Any]:
+        """Return what to take over of a file where the caller of ``load`` has changed some arguments."""
+        return saved
 
     def _take_settings(self, saved: dict[str, Any]) -> None:
         """Take over those settings of a checkpoint that training may have changed, before its parameters.

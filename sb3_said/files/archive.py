@@ -131,7 +131,8 @@ def readable(source: PathOrFile, explained: tuple[type[Exception], ...] = (Saved
     except explained as error:
         raise SavedFileError(f"Cannot load {name}: {str(error).rstrip('.')}.") from error
     except Exception as error:
-        if isinstance(error, Warning) or (isinstance(error, OSError) and error.filename is not None):
+        is_others = isinstance(error, (Warning, th.OutOfMemoryError))  # the second of a GPU
+        if is_others or (isinstance(error, OSError) and error.filename is not None):
             raise  # an OSError with a name is from opening the file, and says so
         if isinstance(error, MemoryError):
             raise SavedFileError(
@@ -229,8 +230,8 @@ def _refuse_pickle(is_pickle: bool) -> None:
         raise SavedFileError(
             "it holds a pickle, as Stable-Baselines3's own files do, and unpickling runs whatever code its author put"
             " there. If you trust the author, load it with Stable-Baselines3, such as SAC.load(path), and hand over"
-            " what it learned: policy.load_state_dict(loaded.policy.state_dict()), or"
-            " set_parameters(loaded.get_parameters()). StableSAC and SAID have more than it, and learn in other units: "
+            " what it learned: set_parameters(loaded.get_parameters()). StableSAC and SAID have more than it, and learn"
+            " in other units: "
             "make them with normalise_states=False, scale_rewards=False, and add exact_match=False"
         )
 

@@ -14,17 +14,24 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EventCallback
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CallbackList,
+    EvalCallback,
+    EventCallback,
+    StopTrainingOnNoModelImprovement,
+)
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_said.files.agents import SafeSaveMixin, agent_state, restore_agent
-from sb3_said.files.archive import SavedFileError, load_tree, readable, save_tree
+from sb3_said.files.archive import SavedFileError, load_metadata, load_tree, readable, save_tree
 from sb3_said.files.arguments import as_data
 from sb3_said.files.normalization import check_statistics, get_statistics, set_statistics
 
 CHECKPOINT_NAME = "checkpoint.zip"
 _EVALUATION = ("n_calls", "best_mean_reward", "evaluations_timesteps", "evaluations_results", "evaluations_length")
 _SUCCESSES = "evaluations_successes"  # of tasks that tell them, and empty for others
+_PATIENCE = "no_improvement"  # of callbacks that stop where nothing has improved: the best mean, and evaluations since
 
 SECONDS = 600.0  # of training between two checkpoints, at least
 BYTES_A_SECOND = 500_000  # that checkpoints write at most, over the whole training
@@ -101,13 +108,25 @@ class TrainingCheckpointCallback(BaseCallback):
     def _on_training_start(self) -> None:
         self._tried_at = self.model.num_timesteps
         is_there = self.path.exists()
-        self._saved_at = self._tried_at if is_there and self._tried_at > 0 else -1
+        self._saved_at = self._tried_at if self._tried_at > 0 and is_there and self._is_own() else -1
         self._clock.wait()
         assert isinstance(self.model, SafeSaveMixin)
         # A resume makes an agent anew: it has the replay that this one was given from nowhere else, and would take a
         # checkpoint that another run has left in this folder
         if self._saved_at < 0 and (is_there or (self.keeps_replay and _replay_buffer(self.model).size() > 0)):
             self.save()
+
+    def _is_own(self) -> bool:
+        """Tell whether the checkpoint that is there is of this agent as it is now."""
+        try:
+            return bool(load_metadata(self.path)["metadata"].get("at") == self._now())
+        except SavedFileError:
+            return False
+
+    def _now(self) -> list[int]:
+        assert isinstance(self.model, SafeSaveMixin)
+        weights = self.model.policy.state_dict().values()
+        return [self.model.num_timesteps, crc32(x.numpy(force=True) for x in weights)]
 
     def _on_rollout_start(self) -> None:
         # Here, and not in on_step, the replay buffer holds every step taken and the updates have caught up with it.
@@ -139,7 +158,8 @@ class TrainingCheckpointCallback(BaseCallback):
             state = training_state(self.model, self.locals.get("callback"), self.keeps_replay)
             check_finite(state, self.path)
             monitors = {file.name: file.stat().st_size for file in self.path.parent.glob("*.monitor.csv")}
-            if self._clock.save(f"The checkpoint of step {self._tried_at}", state, {"monitors": monitors}):
+            about = {"monitors": monitors, "at": self._now()}
+            if self._clock.save(f"The checkpoint of step {self._tried_at}", state, about):
                 self._saved_at = self._tried_at
         return self._saved_at == self._tried_at
 
@@ -205,7 +225,10 @@ def crc32(arrays: Iterable[np.ndarray]) -> int:
 def evaluations_of(callback: BaseCallback | None) -> list[dict[str, Any]]:
     """Return the evaluations that each ``EvalCallback`` has made so far."""
     return [
-        {name: np.array(getattr(evaluation, name)).tolist() for name in (*_EVALUATION, _SUCCESSES)}
+        {
+            **{name: np.array(getattr(evaluation, name)).tolist() for name in (*_EVALUATION, _SUCCESSES)},
+            _PATIENCE: [[float(one.last_best_mean_reward), one.no_improvement_evals] for one in _stoppers(evaluation)],
+        }
         for evaluation in _eval_callbacks(callback)
     ]
 
@@ -234,6 +257,8 @@ def restore_evaluations(callback: BaseCallback | None, saved: list[dict[str, Any
         for name in _EVALUATION:
             setattr(eval_callback, name, kept[name])
         eval_callback.evaluations_successes = kept[_SUCCESSES]
+        for stopper, (best, n) in zip(_stoppers(eval_callback), kept.get(_PATIENCE, []), strict=False):
+            stopper.last_best_mean_reward, stopper.no_improvement_evals = best, n
 
 
 def restore_training(model: SafeSaveMixin, path: str | Path, callback: BaseCallback | None = None) -> None:
@@ -324,6 +349,16 @@ def _check_evaluation(saved: dict[str, Any]) -> None:
         raise SavedFileError("evaluations differ in how many they are")
     if any(np.asarray(rows).dtype.kind not in "bif" for rows in (*results, successes) if rows):
         raise SavedFileError("evaluations hold more than numbers")
+    for mean, n in saved.get(_PATIENCE, []):  # of before 2026-11-30 without
+        if type(mean) is not float or mean != mean or type(n) is not int or n < 0:
+            raise SavedFileError(f"an evaluation has not improved on {mean!s:.20} for {n!s:.20}")
+
+
+def _stoppers(evaluation: EvalCallback) -> list[StopTrainingOnNoModelImprovement]:
+    """Return the callbacks below an ``EvalCallback`` that stop where nothing has improved."""
+    children = [evaluation.callback_on_new_best, evaluation.callback]
+    several = [one for child in children for one in (child.callbacks if isinstance(child, CallbackList) else [child])]
+    return [one for one in several if isinstance(one, StopTrainingOnNoModelImprovement)]
 
 
 def _is_finite(x: Any) -> bool:

@@ -37,7 +37,7 @@ from sb3_said.delays.space import (
     written_ages,
 )
 from sb3_said.delays.wrapper import DelayedObservationWrapper
-from sb3_said.files.agents import SafeSaveMixin, existing, with_suffix
+from sb3_said.files.agents import SafeSaveMixin, agent_state, existing, with_suffix
 from sb3_said.files.archive import load_tree, readable, save_tree
 from sb3_said.files.checks import RANGES, check_argument, declared
 from sb3_said.replay.buffer import DelayedReplayBuffer, rows_for_logs
@@ -181,6 +181,15 @@ class DelayedSAC(SafeSaveMixin, SAC):
                 f"VecNormalize must leave actions and ages as they are, but normalises {', '.join(sorted(keys))}; "
                 "use VecNormalize(..., norm_obs_keys=['observation'])."
             )
+
+    def _adapt_saved(self, saved: dict[str, Any], changed: set[str]) -> dict[str, Any]:
+        """Leave the file's entropy coefficient out where the caller has given another."""
+        if "ent_coef" not in changed:
+            return saved
+        own, optimizer = agent_state(self), "ent_coef_optimizer"
+        parameters = {name: part for name, part in saved["parameters"].items() if name != optimizer}
+        parameters |= {optimizer: own["parameters"][optimizer]} if optimizer in own["parameters"] else {}
+        return {**saved, "parameters": parameters, "variables": own["variables"]}
 
     def _policy_flags(self) -> dict[str, Any]:
         """Return what the policy's constructor needs of this algorithm's own arguments."""

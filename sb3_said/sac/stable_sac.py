@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import io
+import pathlib
+import warnings
 from typing import Any
 
 import numpy as np
@@ -124,7 +127,26 @@ class StableSAC(DelayedSAC):
     ) -> tuple[int, BaseCallback]:
         if reset_num_timesteps and self.policy.training_episodes is not None:
             self.policy.training_episodes.forget()  # another task may return less from now on
+        vec_normalize = self.get_vec_normalize_env()
+        if self.scale_rewards and vec_normalize is not None and vec_normalize.norm_reward:
+            warnings.warn(
+                f"VecNormalize normalises rewards, and {type(self).__name__} scales them by the largest return so far: "
+                "one of the first steps, where VecNormalize knows no size yet. Give VecNormalize(..., "
+                "norm_reward=False), or scale_rewards=False.",
+                stacklevel=3,
+            )
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """Read a replay as :class:`DelayedSAC` does; an agent that has seen no reward scales by those in it."""
+        super().load_replay_buffer(path, truncate_last_traj)
+        scale, replay = self.policy.return_scale, self.replay_buffer
+        if scale is None or scale.count >= 1.0:
+            return
+        returns = np.zeros(replay.n_envs)
+        for row in (replay.pos - replay.size() + np.arange(replay.size())) % replay.buffer_size:  # oldest first
+            returns = replay.rewards[row] + self.gamma * np.where(replay.steps[row] == 0, 0.0, returns)
+            scale.update(returns)
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
         super()._update_info_buffer(infos, dones)

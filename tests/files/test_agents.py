@@ -91,6 +91,48 @@ def test_an_adafactor_loads_on_a_machine_with_a_gpu(tmp_path, monkeypatch):
     assert same(model.get_parameters(), loaded.get_parameters())
 
 
+def ent_coef_of(model):
+    return model.ent_coef_tensor.item() if model.ent_coef_optimizer is None else model.log_ent_coef.exp().item()
+
+
+@pytest.mark.parametrize("how", ["kwargs", "custom_objects"])
+@pytest.mark.parametrize(("before", "after"), [(0.1, 0.5), ("auto_0.1", "auto_0.5"), ("auto_0.1", 0.5), (0.1, "auto")])
+def test_another_entropy_coefficient_is_the_one_that_is_learned_with(how, before, after, tmp_path):
+    make_sac(ent_coef=before).learn(20).save(tmp_path / "agent")
+    given = {"ent_coef": after} if how == "kwargs" else {"custom_objects": {"ent_coef": after}}
+    loaded = DelayedSAC.load(tmp_path / "agent", env="Pendulum-v1", device="cpu", **given)
+    wanted = 1.0 if after == "auto" else 0.5
+    assert loaded.ent_coef == after and ent_coef_of(loaded) == pytest.approx(wanted)
+    loaded.learn(5, reset_num_timesteps=False)
+    same_as_saved = DelayedSAC.load(tmp_path / "agent", device="cpu", ent_coef=before)
+    assert ent_coef_of(same_as_saved) == pytest.approx(0.1, abs=0.01)
+
+
+def test_networks_with_another_activation_are_refused(tmp_path):
+    make_sac(policy_kwargs={"net_arch": [8], "activation_fn": th.nn.Tanh}).learn(20).save(tmp_path / "agent")
+    model = make_sac(policy_kwargs={"net_arch": [8]})
+    with pytest.raises(
+        SavedFileError,
+        match=r"its policy_kwargs are \{'activation_fn': .*Tanh.*, and this agent's \{'use_sde': False\}",
+    ):
+        model.set_parameters(tmp_path / "agent")
+    make_sac(policy_kwargs={"net_arch": [8], "activation_fn": th.nn.Tanh}).set_parameters(tmp_path / "agent")
+
+
+def test_what_is_no_fault_of_the_file_is_not_told_as_one(tmp_path, monkeypatch):
+    make_sac().save(tmp_path / "agent")
+    with pytest.raises(ValueError, match="learning_starts is '2', which is not of the type") as error:
+        DelayedSAC.load(tmp_path / "agent", device="cpu", learning_starts="2")
+    assert not isinstance(error.value, SavedFileError)
+
+    def full(*_, **__):
+        raise th.OutOfMemoryError("CUDA out of memory.")
+
+    monkeypatch.setattr(DelayedSAC.policy_aliases["MlpPolicy"], "to", full)
+    with pytest.raises(th.OutOfMemoryError):
+        DelayedSAC.load(tmp_path / "agent", device="cpu")
+
+
 def test_file_objects_and_any_name(trained, tmp_path):
     file = io.BytesIO()
     trained.save(file)

@@ -10,10 +10,16 @@ import pytest
 import torch as th
 from kill import Kill, Killed
 from stable_baselines3 import SAC
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EveryNTimesteps
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CallbackList,
+    EvalCallback,
+    EveryNTimesteps,
+    StopTrainingOnNoModelImprovement,
+)
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.files import checkpoint
@@ -270,9 +276,9 @@ def test_a_resume_after_a_callback_has_ended_training_joins_no_two_episodes(tmp_
 def test_when_checkpoints_are_written(tmp_path, monkeypatch, n_envs, save_freq, expected):
     written = []
 
-    def save(path, state, _):
+    def save(path, state, metadata):
         written.append((path, state["counters"]))
-        path.touch()
+        save_tree(path, state, metadata)
 
     monkeypatch.setattr(checkpoint, "save_tree", save)
     model = make(make_vec_env(delayed, n_envs=n_envs)).learn(100, TrainingCheckpointCallback(tmp_path, save_freq))
@@ -391,6 +397,35 @@ def test_a_checkpoint_of_another_run_is_not_taken_for_this_one_s(tmp_path):
     with pytest.raises(Killed):
         make(seed=7).learn(60, [callback, Kill(30)])
     assert load_tree(tmp_path / CHECKPOINT_NAME)["counters"]["num_timesteps"] == 0
+
+
+def test_nor_is_it_for_one_that_has_learned_before(tmp_path):
+    mine = make(seed=7).learn(40)
+    make(seed=0).learn(60, TrainingCheckpointCallback(tmp_path, 20))
+    with pytest.raises(Killed):
+        mine.learn(60, [TrainingCheckpointCallback(tmp_path, 1000), Kill(70)], reset_num_timesteps=False)
+    again = make(seed=7)
+    restore_training(again, tmp_path / CHECKPOINT_NAME)
+    assert again.num_timesteps == 40
+    kept = (tmp_path / CHECKPOINT_NAME).read_bytes()
+    with pytest.raises(Killed):  # and what it was restored from is not written again
+        again.learn(60, [TrainingCheckpointCallback(tmp_path, 1000), Kill(70)], reset_num_timesteps=False)
+    assert (tmp_path / CHECKPOINT_NAME).read_bytes() == kept
+
+
+def test_the_patience_of_a_run_goes_on(tmp_path):
+    def callbacks(folder):
+        task = DummyVecEnv([lambda: Monitor(gym.wrappers.TransformReward(delayed(), lambda reward: 1.0))])
+        stop = StopTrainingOnNoModelImprovement(3, 0)
+        evaluated = EvalCallback(task, callback_after_eval=stop, eval_freq=20, n_eval_episodes=1, verbose=0)
+        return [evaluated, TrainingCheckpointCallback(folder)]
+
+    whole = make().learn(1000, callbacks(tmp_path))
+    make().learn(75, callbacks(tmp_path / "parts"))
+    again, others = make(), callbacks(tmp_path / "parts")
+    restore_training(again, tmp_path / "parts" / CHECKPOINT_NAME, CallbackList(others))
+    again.learn(925, others, reset_num_timesteps=False)
+    assert again.num_timesteps == whole.num_timesteps == 100
 
 
 @pytest.mark.parametrize("is_late", [False, True])  # told from the second evaluation on, as of a goal that is reached

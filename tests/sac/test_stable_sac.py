@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import warnings
 from functools import partial
 
 import gymnasium as gym
@@ -451,6 +452,32 @@ def test_scales_are_part_of_the_agent(tmp_path):
     obs, _ = delayed(3).reset(seed=0)
     np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
     assert loaded.target_entropy == model.target_entropy == -0.5
+
+
+def test_a_replay_that_was_loaded_is_scaled_as_by_whom_it_is_of(tmp_path):
+    """By an agent that has seen no reward; the other's count is of all its steps, and the replay keeps the newest."""
+    for size in (500, 90):
+        teacher = make(delayed(3), buffer_size=size).learn(120)
+        teacher.save_replay_buffer(tmp_path / "replay")
+        model = make(delayed(3), buffer_size=size, seed=1)
+        model.load_replay_buffer(tmp_path / "replay")
+        own, theirs = model.policy.return_scale, teacher.policy.return_scale
+        assert own.value == pytest.approx(float(theirs.value), rel=0 if size == 500 else 0.5) and own.value != 1
+        assert own.count == pytest.approx(min(size, 120), abs=1)
+        before = {name: x.clone() for name, x in own.state_dict().items()}
+        model.load_replay_buffer(tmp_path / "replay")  # its own count by now
+        assert before == dict(own.state_dict())
+
+
+def test_rewards_that_vec_normalize_normalises_too_are_warned_of():
+    env = VecNormalize(make_vec_env(lambda: delayed(3), 1), norm_obs_keys=["observation"])
+    with pytest.warns(UserWarning, match="VecNormalize normalises rewards, and StableSAC scales them"):
+        make(env).learn(10)
+    for kwargs, norm_reward in (({"scale_rewards": False}, True), ({}, False)):
+        env = VecNormalize(make_vec_env(lambda: delayed(3), 1), norm_obs_keys=["observation"], norm_reward=norm_reward)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            make(env, **kwargs).learn(10)
 
 
 def test_beside_vec_normalize():
