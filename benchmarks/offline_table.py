@@ -6,7 +6,7 @@
 Each file is of motivation.py (its players, of one planner seed), or of sb3-said over-delays (one agent, which is named
 after the comma). Files of one task, set and name are seeds of the same training.
 
-plots   95 % intervals are over seeds where there are several, else over episodes
+plots   95 % intervals are over the episodes of all seeds together
 score   D4RL's normalised score of the mean return; in brackets the seeds' own where there are several
 kept    the return as a part of the same agent's at delay 0
 paper   what Table 2 of arXiv 2603.01553 has for SAID and DQL+SA at these delays, on D4RL's -v2 sets, of which
@@ -122,7 +122,7 @@ def main(argv: list[str] | None = None) -> dict[tuple[str, str], dict[str, Seeds
     show(found)
     for (kind, env), rows in found.items() if args.plot else ():
         returns: dict[str, Any] = {
-            agent: {d: np.array(x if len(x) > 1 else x[0]) for d, x in seeds.items()} for agent, seeds in rows.items()
+            agent: {d: np.concatenate(x) for d, x in seeds.items()} for agent, seeds in rows.items()
         }
         plots.save(plots.plot_over_delays(returns, f"{env}, {kind} log")[0], args.plot / f"{env}-{kind}.png")
     return found
