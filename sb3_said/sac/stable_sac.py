@@ -141,12 +141,12 @@ class StableSAC(DelayedSAC):
         """Read a replay as :class:`DelayedSAC` does; an agent that has seen no reward scales by those in it."""
         super().load_replay_buffer(path, truncate_last_traj)
         scale, replay = self.policy.return_scale, self.replay_buffer
-        if scale is None or scale.count >= 1.0:
+        if scale is None or scale.count >= 1.0 or replay.holds_logs or replay.size() == 0:
             return
-        returns = np.zeros(replay.n_envs)
+        returns = [np.zeros(replay.n_envs)]
         for row in (replay.pos - replay.size() + np.arange(replay.size())) % replay.buffer_size:  # oldest first
-            returns = replay.rewards[row] + self.gamma * np.where(replay.steps[row] == 0, 0.0, returns)
-            scale.update(returns)
+            returns.append(replay.rewards[row] + self.gamma * np.where(replay.steps[row] == 0, 0.0, returns[-1]))
+        scale.update(np.concatenate(returns[1:]))
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
         super()._update_info_buffer(infos, dones)
