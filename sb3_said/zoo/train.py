@@ -63,7 +63,8 @@ def own_parser() -> argparse.ArgumentParser:
     parser = make_parser(__doc__, EXAMPLES, add_help=False)
     parser.add_argument("-h", "--help", action="store_true", help="show this help, then that of rl_zoo3")
     parser.add_argument("--algo", choices=list(ALGORITHMS), help="default: said")
-    parser.add_argument("--env", help="task, of continuous actions (default: Pendulum-v1)")
+    parser.add_argument("--env", help="task, of continuous actions, or MODULE:TASK, which MODULE registers (default: "
+                        "Pendulum-v1)")  # fmt: skip
     add_delay(parser, default="no delay")
     add_delay(
         parser,
@@ -178,7 +179,9 @@ def read_command_line(argv: list[str]) -> tuple[Run, str, list[str]]:
     seed = secrets.randbelow(10_000) if options.seed is None or options.seed < 0 else options.seed
     dataset = [os.path.abspath(source) if is_file(source) else source for source in options.dataset]
     run = Run(delay, options.preset or "cpu", options.checkpoint_freq, None, expert_delay, None, dataset)
-    return run, algo, joined_settings([f"--env={options.env or 'Pendulum-v1'}", f"--seed={seed}", *zoo_argv])
+    module, _, env = (options.env or "Pendulum-v1").rpartition(":")  # Gymnasium's way to name whoever registers it
+    packages = ["--gym-packages", module] if module else []
+    return run, algo, joined_settings([f"--env={env}", f"--seed={seed}", *zoo_argv, *packages])
 
 
 def of_the_start(argv: list[str]) -> dict[str, Any]:

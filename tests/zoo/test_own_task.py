@@ -19,7 +19,7 @@ from trained_run import PLANNER, train_here
 
 from sb3_said import DelayedObservationWrapper, DelayedSAC
 from sb3_said.zoo import enjoy, evaluate, manager, over_delays, train, tune
-from sb3_said.zoo.record import WRAPPER
+from sb3_said.zoo.record import WRAPPER, Record
 from sb3_said.zoo.runs import load_run
 
 PLANNED = ("planner_gradient_steps:2", "planner_trial_episodes:0", f"planner_kwargs:{PLANNER}")
@@ -155,6 +155,16 @@ def forget_mine(monkeypatch: pytest.MonkeyPatch) -> None:
     """Be a process that has not imported the user's package."""
     for registered in (gym.registry, sys.modules):
         monkeypatch.delitem(registered, {id(gym.registry): "Mine-v0"}.get(id(registered), "mine"), raising=False)
+
+
+def test_a_task_is_named_with_its_module_as_gymnasium_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    forget_mine(monkeypatch)
+    train_here(tmp_path, f"--algo sadr --env mine:Mine-v0 --delay 1 {QUICK}", "--env-kwargs", "length:5")
+    run = tmp_path / "sadr" / "Mine-v0-delay1-seed3_1"
+    record = Record.read(run)
+    assert (record.env, record.gym_packages) == ("Mine-v0", ["mine"])
+    forget_mine(monkeypatch)
+    assert load_run(run, device="cpu").model.num_timesteps == 40
 
 
 def test_a_run_remembers_the_package_of_its_task(
