@@ -82,15 +82,16 @@ def opened(args: argparse.Namespace) -> tuple[dict[str, LoadedRun], Path, float]
     if args.plot is not None:
         plots.check_file(args.plot)  # what cannot be drawn is told now, and not after the episodes
         check_writable(args.plot)
-    how_played = args.algo, args.env, read_delay(args.delay), args.device, None, args.gym_packages
-    run = load_run(args.run, *how_played)
+    played: dict[str, Any] = {"algo": args.algo, "env_id": args.env, "delay": read_delay(args.delay)}
+    played |= {"device": args.device, "gym_packages": args.gym_packages}
+    run = load_run(args.run, **played)
     if args.realtime and not args.delay and run.own_delay is None:  # what answers take is all the delay there is
-        how_played = args.algo, args.env, 0, args.device, None, args.gym_packages
-        run = load_run(args.run, *how_played)
+        played["delay"] = 0
+        run = load_run(args.run, **played)
     best = run.folder / BEST_NAME
     runs = {"best" if Path(run.info["file"]) == best else "last": run}
     if "last" in runs and Path(args.run).is_dir() and best.is_file():
-        runs["best"] = load_run(best, *how_played)
+        runs["best"] = load_run(best, **played)
         if runs["best"].info["trained_steps"] == run.info["trained_steps"]:
             del runs["best"]  # the last one is the best
     period: float = args.period or (args.realtime and control_period(run)) or 0.0
