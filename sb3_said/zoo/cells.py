@@ -38,7 +38,8 @@ class Cell:
     """its path: absolute where the command line has it so, else from the working directory, and from the results'
     folder within their file"""
     sha256: str
-    """of the file, and of what its run changes in the task but the delay, if anything"""
+    """of the file, and of what else decides what it sees: what its run changes in the task but the delay, and the
+    statistics of ``VecNormalize``, if anything"""
     trained_steps: int
     obstacle: str | None
     """why the agent cannot play this delay"""

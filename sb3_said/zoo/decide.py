@@ -92,24 +92,30 @@ def main(argv: list[str] | None = None) -> None:
             let_answer(model, args.answer or model.policy.who_answers, *expert_ages)
         if args.output is not None:
             check_target(args.output)
-        config = model.policy.planner.config
-        for name in SAMPLING_SETTINGS:
-            print(f"{name:14} {getattr(config, name)}" + "  (new)" * (name in settings))
-        if config.decided_by == "actor":
-            print(
-                "The expert acts on the guessed present, and nothing is planned: the settings above present change "
-                "nothing."
-            )
-        elif config.temperature == 0:
-            print(
-                "At temperature 0 there is one candidate: n_candidates, scored_states and choice_factor change nothing."
-            )
-        if not model.policy.planner_is_trained:
-            print("The planner of this agent is not trained yet.")
-        who, ages = model.policy.who_answers, written_ages([*model.policy.expert_ages])
-        print(f"{'answers':14} {who}{f': the expert at ages {ages}' * (who == 'both')}{'  (new)' * sets_answer}")
+        show(model, settings, sets_answer)
         if args.output is not None:
             hand_on(model, args.agent, args.output, args.compact)
+
+
+def show(model: SAID, settings: dict[str, Any], sets_answer: bool) -> None:
+    """Print how an agent decides, and who answers in it.
+
+    :param settings: those that are new
+    :param sets_answer: whether who answers is new
+    """
+    config = model.policy.planner.config
+    for name in SAMPLING_SETTINGS:
+        print(f"{name:14} {getattr(config, name)}" + "  (new)" * (name in settings))
+    if config.decided_by == "actor":
+        print(
+            "The expert acts on the guessed present, and nothing is planned: the settings above present change nothing."
+        )
+    elif config.temperature == 0:
+        print("At temperature 0 there is one candidate: n_candidates, scored_states and choice_factor change nothing.")
+    if not model.policy.planner_is_trained:
+        print("The planner of this agent is not trained yet.")
+    who, ages = model.policy.who_answers, written_ages([*model.policy.expert_ages])
+    print(f"{'answers':14} {who}{f': the expert at ages {ages}' * (who == 'both')}{'  (new)' * sets_answer}")
 
 
 def let_answer(model: SAID, who: Answer, up_to: int | None, since: int | None) -> None:

@@ -107,23 +107,36 @@ def main(argv: list[str] | None = None) -> None:
         shown = play_missing(args, delays) if args.runs else known_cells(args, delays)
         shown = [replace(cell, delay=named.setdefault(repr(make_process(cell.delay)), cell.delay)) for cell in shown]
         rows = choose_rows(args.rows, shown)
-        table = make_table(shown, rows)
-        order = delays or list(dict.fromkeys(cell.delay for cell in shown))
-        in_order = sorted(shown, key=lambda cell: (cell.age_error != 0, order.index(cell.delay), cell.age_error))
-        columns, settings = list(dict.fromkeys(cell.column for cell in in_order)), Results(args.json).settings
-        others = unpaired(shown, rows)
-        print_table(table, columns, others)
-        print_seeds(shown, rows)
-        changed = {rows[cell.agent] for cell in shown if cell.is_changed and cell.agent in rows}
-        print_scores({row: x for row, x in table.items() if row not in changed}, columns, settings["env"], others)
-        print_manners(shown, rows)
-        if args.plot is not None and not any(table.values()):
-            print(f"Nothing was played that {args.plot} could show.")
-        elif args.plot is not None:
-            title = f"{settings['env']} under delay: means of {settings['n_episodes']} episodes, 95 % intervals"
-            told_right = {row: {c: x for c, x in of_row.items() if AGE not in str(c)} for row, of_row in table.items()}
-            plots.save(plots.plot_over_delays(told_right, title)[0], args.plot)
-            print(f"Wrote {args.plot}")
+        show(shown, rows, delays, Results(args.json).settings, args.plot)
+
+
+def show(
+    cells: list[Cell], rows: dict[str, str], delays: list[int | str], settings: dict[str, Any], plot: Path | None
+) -> None:
+    """Print the tables of cells that were played, and draw them.
+
+    :param rows: agents, each with the name that the table shows
+    :param delays: in the order of the columns; that of the cells by default
+    :param settings: what all cells have in common
+    :param plot: where to draw to
+    """
+    table = make_table(cells, rows)
+    order = delays or list(dict.fromkeys(cell.delay for cell in cells))
+    in_order = sorted(cells, key=lambda cell: (cell.age_error != 0, order.index(cell.delay), cell.age_error))
+    columns = list(dict.fromkeys(cell.column for cell in in_order))
+    others = unpaired(cells, rows)
+    print_table(table, columns, others)
+    print_seeds(cells, rows)
+    changed = {rows[cell.agent] for cell in cells if cell.is_changed and cell.agent in rows}
+    print_scores({row: x for row, x in table.items() if row not in changed}, columns, settings["env"], others)
+    print_manners(cells, rows)
+    if plot is not None and not any(table.values()):
+        print(f"Nothing was played that {plot} could show.")
+    elif plot is not None:
+        title = f"{settings['env']} under delay: means of {settings['n_episodes']} episodes, 95 % intervals"
+        told_right = {row: {c: x for c, x in of_row.items() if AGE not in str(c)} for row, of_row in table.items()}
+        plots.save(plots.plot_over_delays(told_right, title)[0], plot)
+        print(f"Wrote {plot}")
 
 
 def read_name(word: str) -> int | str:
