@@ -25,6 +25,11 @@ class OnTheHost(nn.Module):
         return self
 
 
+def running_return(reward: np.ndarray, before: np.ndarray, begins: np.ndarray, gamma: float = 1.0) -> np.ndarray:
+    """Return G_t = gamma G_{t-1} + r_t, which starts at 0 where an episode begins: (n_envs,), as all of these."""
+    return reward + gamma * np.where(begins, 0.0, before)
+
+
 class ReturnScale(OnTheHost):
     """The size of discounted returns so far, which rewards are divided by (SimbaV2, https://arxiv.org/abs/2502.15280).
 

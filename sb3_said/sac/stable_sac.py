@@ -17,6 +17,7 @@ from sb3_said.delays.space import UNDELAYED
 from sb3_said.sac.delayed_sac import DelayedSAC
 from sb3_said.sac.episodes import TrainingEpisodes
 from sb3_said.sac.policies import DelayedSACPolicy
+from sb3_said.sac.scaling import running_return
 
 REFIT_GROWTH = 1.1  # the states are looked at again when there are a tenth more of them
 STATES_LOOKED_AT = 10_000
@@ -145,7 +146,7 @@ class StableSAC(DelayedSAC):
             return
         returns = [np.zeros(replay.n_envs)]
         for row in (replay.pos - replay.size() + np.arange(replay.size())) % replay.buffer_size:  # oldest first
-            returns.append(replay.rewards[row] + self.gamma * np.where(replay.steps[row] == 0, 0.0, returns[-1]))
+            returns.append(running_return(replay.rewards[row], returns[-1], replay.steps[row] == 0, self.gamma))
         scale.update(np.concatenate(returns[1:]))
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
@@ -175,10 +176,10 @@ class StableSAC(DelayedSAC):
         begins = replay_buffer.steps[row] == 0  # (n_envs,), as the replay saw it
         if self.policy.return_scale is not None:
             reward = np.asarray(reward, np.float32)  # as a DummyVecEnv has them, and environments in processes do not
-            self._running_returns = reward + self.gamma * np.where(begins, 0.0, self._running_returns)
+            self._running_returns = running_return(reward, self._running_returns, begins, self.gamma)
             self.policy.return_scale.update(self._running_returns)
         if self.policy.training_episodes is not None:
-            self._paid = replay_buffer.rewards[row] + np.where(begins, 0.0, self._paid)
+            self._paid = running_return(replay_buffer.rewards[row], self._paid, begins)
             for i in np.flatnonzero(dones):
                 if infos[i].get("episode") is None:  # no Monitor tells of it
                     self.policy.training_episodes.add(float(self._paid[i]), int(replay_buffer.steps[row, i]) + 1)

@@ -8,6 +8,7 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, nullcontext
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -180,7 +181,7 @@ def naming_libraries() -> Iterator[None]:
         yield
     except (ImportError, AttributeError, OSError) as error:
         try:
-            import mujoco  # noqa: F401  # loads it
+            import_module("mujoco")  # which loads it
         except Exception as cause:
             raise CannotDraw(cause) from error
         raise
