@@ -28,6 +28,21 @@ def test_a_row_is_worked_out_by_hand(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert steadiness.main([f"x={file}", f"y={file}", "--last", "30"]) == rows
 
 
+def test_each_run_of_a_file_has_a_row_with_its_evaluations(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "all.json"
+    short = write_run(tmp_path / "short", [500, 80])
+    steadiness.main([f"x={write_run(tmp_path / 'long', [0, 50, 100, 300])}", f"y={short}", "--json", str(file)])
+    capsys.readouterr()
+    rows = steadiness.main([str(file), "--last", "20", "--each", "20"])
+    assert {name: row["mean"] for name, row in rows.items()} == {"x": 200.0, "y": 290.0}
+    assert capsys.readouterr().out.splitlines() == [
+        "|  | run | 20 | 40 | last: mean | sd / mean | bad |",
+        "|---|---|---|---|---|---:|---|",
+        "| x | long | 50 | 300 | 200 | 0.50 | 1 of 2 |",
+        "| y | short | 80 |  | 290 | 0.72 | 1 of 2 |",
+    ]
+
+
 def test_a_name_that_a_file_lacks_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "runs.json"
     file.write_text('[{"name": "stable", "run": "a", "steps": [1], "returns": [[1.0]]}]')
