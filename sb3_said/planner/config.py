@@ -87,7 +87,7 @@ class PlannerConfig:
     sampling_steps: int = 5  # of DDIM; 99.6 % of the paper's return with 20
     n_candidates: int = 16  # measured; the paper's 50 cost three times as much
     # Factor on the initial noise, >= 0; at 0 one candidate is drawn and nothing chosen. Measured (results/settings.md):
-    # choosing by the critics, which the expert's actor has already followed, led to falls; the paper tunes 0.1 to 1
+    # choosing by the critics, which the expert's actor has already followed, led to falls; the paper's are 0.1 to 1
     temperature: float = 0.0
     # "decision": the decision alone, at the present that the candidates agree on, so that actions compete and not
     # beliefs (measured: 2,875 against 2,199 for "future", 8 episodes each); "future": states after the decision index;

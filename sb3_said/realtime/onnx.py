@@ -17,6 +17,7 @@ class OnnxModel:
     """Answers with a file of ``sb3-said export``, for a :class:`~sb3_said.realtime.ControlLoop`; on one thread.
 
     :param path: of the file
+    :raises FileNotFoundError: where there is no such file
     :raises ImportError: without the package onnxruntime
     :raises ValueError: for a file that is damaged, or of another program
     """

@@ -56,6 +56,7 @@ class StableSAC(DelayedSAC):
         faster with it; Hopper-v5 does not, and Walker2d-v5 falls for longer (results/stable_expert.md)
     :param sac_kwargs: every other argument of :class:`DelayedSAC`
     :raises ValueError: as ``DelayedSAC`` does, and for a ``policy_delay`` or an ``actor_averaging`` out of range
+    :raises TypeError: for an unknown argument
     """
 
     policy: DelayedSACPolicy

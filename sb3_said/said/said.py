@@ -70,6 +70,7 @@ class SAID(PlannerLearner, StableSAC):
     :raises ValueError: as ``DelayedSAC`` does, for settings of planner or V(s) outside their range, and for a
         ``state_history`` in the observations that the planner is not trained to read or that ``VecNormalize`` leaves
         unscaled
+    :raises TypeError: for an unknown argument, such as a setting of the planner outside ``planner_kwargs``
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": SAIDPolicy, "MultiInputPolicy": SAIDPolicy}
@@ -321,7 +322,7 @@ class SAID(PlannerLearner, StableSAC):
         :param progress_bar: show one
         :param settings: fields of :class:`~sb3_said.said.student.Distillation`, such as ``n_labels`` or ``q_weight``
         :return: root mean square of its error over held-out answers of the planner, in actions in [-1, 1]
-        :raises ValueError: without a trained planner, without both a replay and an environment, or where the scale of
+        :raises ValueError: without a trained planner, with neither a replay nor an environment, or where the scale of
             the replay's states is missing
         """
         config, width = Distillation(**settings), (self.student_width or 256) if width is None else width

@@ -22,7 +22,7 @@ MakeEnv = Callable[[int], VecEnv]  # of a number of environments
 
 CUT_AT = 10  # times the longest stored episode: a good answer may never end one
 FIRST_PART = 0.25  # of a trial's episodes, which all ways play
-AT_ONCE = 5  # environments: a CPU core decides for each in a quarter of the time (measured, results/settings.md)
+AT_ONCE = 5  # environments: a CPU core decides for each in .25 to .39 of the time (measured, results/settings.md)
 GO_ON = 3  # ways that play the others, too (simulated with episodes of 30 planners, results/settings.md)
 LATER = "train_planner() plays one later, and so does --resume with as many steps (-n) as the run had."
 

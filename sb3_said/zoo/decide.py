@@ -36,8 +36,8 @@ examples:
   # the planner up to 8 steps, the expert beyond: whichever is better where
   sb3-said decide ant.zip --answer both --expert-from 9 -o ant_both.zip
 
-  # the fastest decision: one candidate, one denoising step
-  sb3-said decide hopper.zip --temperature 0 --sampling-steps 1 -o hopper_fast.zip
+  # the fastest plan: one candidate, one denoising step; faster still is --decided-by actor, which plans nothing
+  sb3-said decide hopper.zip --decided-by plan --temperature 0 --sampling-steps 1 -o hopper_fast.zip
 
 At temperature 0 the planner draws one candidate from no noise, and no critic is asked. Above 0 it draws several: the
 critics score them, and the best decides (--choice-factor none), or the mean of all does, each weighed by

@@ -50,7 +50,7 @@ examples:
   sb3-said tune logs/said/Hopper-v5-delay4-seed1_1 & sb3-said tune logs/said/Hopper-v5-delay4-seed1_1
 
   # a quick look: one depth, fewer updates, fewer episodes, in a folder of its own
-  sb3-said tune logs/said/Hopper-v5-delay4-seed1_1 --depths 2 --gradient-steps 5000 --episodes 10 --output look
+  sb3-said tune logs/said/Hopper-v5-delay4-seed1_1 --depths 2 --gradient-steps 1000 --episodes 10 --output look
 
   # how the critics choose: the larger the factor, the more the best candidate decides; 100 hardly asks another
   sb3-said tune logs/said/Hopper-v5-delay4-seed1_1 --depths 2 --temperatures 0.5 1 --choice-factors 0.3 1 3 100
