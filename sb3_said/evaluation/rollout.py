@@ -106,13 +106,8 @@ def rollout(
                 action = np.array(actions[row], np.float64)  # a copy: a model may write all its answers into one array
                 changes[episode] += np.mean(np.abs(action - before.get(episode, action)) / half_range)
                 before[episode] = action
-                if lengths[episode] == LONG and not (terminated or truncated):
-                    warnings.warn(
-                        f"Episode {episode} has not ended after {LONG:,} steps, and is waited for. If it need never "
-                        "end, register the task with max_episode_steps, or train it with "
-                        "--env-kwargs max_episode_steps:1000.",
-                        stacklevel=2,
-                    )
+                if not (terminated or truncated):
+                    warn_if_long(lengths[episode], f"Episode {episode}")
                 if on_step is not None:
                     on_step(e)
                 if terminated or truncated:
@@ -137,6 +132,20 @@ def rollout(
             e.close()
     changes /= np.maximum(lengths - 1, 1)
     return Rollout(returns, lengths, ended, changes, np.array(call_seconds), np.array(batch_sizes, np.int64))
+
+
+def warn_if_long(steps: int, episode: str = "An episode") -> None:
+    """Warn once of an episode that may have no end, as the task's author may not know.
+
+    :param steps: that it has lasted so far
+    :param episode: what to call it
+    """
+    if steps == LONG:
+        warnings.warn(
+            f"{episode} has not ended after {LONG:,} steps, and is waited for. If it need never end, register the "
+            "task with max_episode_steps, or train it with --env-kwargs max_episode_steps:1000.",
+            stacklevel=3,
+        )
 
 
 def collect_observations(env: EnvMaker, n_observations: int, seed: int) -> Observation:

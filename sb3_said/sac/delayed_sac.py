@@ -43,6 +43,8 @@ from sb3_said.files.checks import RANGES, check_argument, declared
 from sb3_said.replay.buffer import DelayedReplayBuffer, rows_for_logs
 from sb3_said.sac.policies import SERVED, DelayedSACPolicy, as_array
 
+REPLAY = "replay buffer"  # kind of its file
+
 
 class DelayedSAC(SafeSaveMixin, SAC):
     """SAC whose actor knows the actions sent since and whose critics know the true state (SADR).
@@ -399,7 +401,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
 
         :param path: of the file, to which ``.pkl`` is added where it has no suffix, or a binary file object
         """
-        save_tree(with_suffix(path, ".pkl"), self.replay_buffer.state_dict())  # type: ignore[arg-type]  # as in loading
+        file = with_suffix(path, ".pkl")  # type: ignore[arg-type]  # io.BufferedIOBase is IO, as in loading
+        save_tree(file, self.replay_buffer.state_dict(), kind=REPLAY)
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """Read what ``save_replay_buffer`` wrote into this agent's buffer, running no code from the file.
@@ -410,7 +413,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
             ``buffer_size`` or ``n_envs``, or of logs that this algorithm does not learn from
         """
         found = existing(path, ".pkl")  # type: ignore[arg-type]  # io.BufferedIOBase is IO
-        state = load_tree(found)
+        state = load_tree(found, (REPLAY, "tree"))  # as which it was written until 2026-11-30
         replay = self.replay_buffer
         with readable(found, explained=(ValueError,)):
             if state["holds_logs"] is True:  # however long they are

@@ -300,7 +300,8 @@ class PlannerLearner(OfflineAlgorithm):
         except ValueError as error:
             warnings.warn(f"No trial is played, and the planner answers: {error}", stacklevel=3)
             return False
-        if self.replay_buffer.dones[: self.replay_buffer.size()].any():
+        n_stored = self.replay_buffer.size()
+        if n_stored == 0 or self.replay_buffer.dones[:n_stored].any():  # of an empty one the training itself tells
             return True
         warnings.warn(
             "No episode has ended in what the agent has stored, so a trial might never end: the planner answers as it "

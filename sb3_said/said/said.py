@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_said.delays.space import ages_of, has_state_history
 from sb3_said.files.archive import PathOrFile
-from sb3_said.files.arguments import from_data
+from sb3_said.files.arguments import from_data, instead_of
 from sb3_said.offline import IQLConfig, OfflineAlgorithm
 from sb3_said.offline.learning import listed
 from sb3_said.planner.checks import whole
@@ -278,11 +278,10 @@ class SAID(PlannerLearner, StableSAC):
             ``scored_states="decision"`` where V(s) scores, in which no action shows, and for ``decided_by="actor"``
             where no expert has learned
         """
-        if others := sorted(set(settings) - set(SAMPLING_SETTINGS)):
-            raise ValueError(
-                f"Only {', '.join(SAMPLING_SETTINGS)} can be changed, got {', '.join(others)}; "
-                "give it as planner_kwargs of a new agent."
-            )
+        for name in sorted(set(settings) - set(SAMPLING_SETTINGS)):
+            is_one = name in self.planner_kwargs
+            remedy = "give it as planner_kwargs of a new agent" if is_one else instead_of(name, SAMPLING_SETTINGS)
+            raise ValueError(f"Only {', '.join(SAMPLING_SETTINGS)} can be changed, got {name}; {remedy}.")
         check_scored(settings, self.policy.values is not None)
         self._check_decider(settings.get("decided_by"))
         self.policy.planner.config = replace(self.policy.planner.config, **settings)

@@ -1,4 +1,4 @@
-"""How an agent answers once its training has ended: the planner's own evaluation, in the files that rl_zoo3 reads."""
+"""What a run plays beside its training: evaluations while it learns, and of the agent as it answers in the end."""
 
 from __future__ import annotations
 
@@ -11,15 +11,52 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import sync_envs_normalization
+from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_said import SAID, DelayedSAC
+from sb3_said.evaluation.rollout import warn_if_long
 from sb3_said.files.atomic import replacing
 from sb3_said.files.normalization import normalization_file, save_normalization
 from sb3_said.zoo.stopping import Stopping
 
+
 BEST_NAME = "best_model.zip"  # of the agent that did best in training, as SB3's EvalCallback names it
 EXPERT_FOLDER = "expert"  # in the run's: what EvalCallback wrote while the expert learned
+
+
+class _BrokenOff(Exception):
+    pass
+
+
+class StoppableEvaluation(EvalCallback):
+    """SB3's, which breaks off where the training is asked to stop.
+
+    A resume plays it in its first step, and those that follow one step later, too.
+
+    :param stopping: says whether the training is asked to stop
+    """
+
+    def __init__(self, eval_env: VecEnv, stopping: Stopping, **kwargs: Any):
+        super().__init__(eval_env, **kwargs)
+        self.stopping = stopping
+
+    def _on_step(self) -> bool:
+        try:
+            return super()._on_step()
+        except _BrokenOff:
+            self.n_calls -= 1  # so that the next call is the one that plays
+            return True
+
+    def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
+        if self.stopping.is_asked:
+            raise _BrokenOff
+        _warn_if_long(locals_)
+        super()._log_success_callback(locals_, globals_)
+
+
+def _warn_if_long(of_evaluate_policy: dict[str, Any]) -> None:
+    if not of_evaluate_policy["done"]:
+        warn_if_long(int(of_evaluate_policy["current_lengths"][of_evaluate_policy["i"]]))
 
 
 def evaluate_answer(model: SAID, like: EvalCallback, folder: Path, stopping: Stopping) -> None:
@@ -34,9 +71,10 @@ def evaluate_answer(model: SAID, like: EvalCallback, folder: Path, stopping: Sto
     if model.get_vec_normalize_env() is not None:
         sync_envs_normalization(model.env, like.eval_env)  # type: ignore[arg-type]  # a trained agent has one
 
-    def on_step(*_: object) -> None:
+    def on_step(locals_: dict[str, Any], _: object) -> None:
         if stopping.is_asked:
             raise KeyboardInterrupt
+        _warn_if_long(locals_)
 
     like.eval_env.seed(model.seed)  # a run that goes on after a stop plays the episodes of one that was not stopped
     played: Any = evaluate_policy(

@@ -73,7 +73,7 @@ class Video:
         """Take a frame, if one is due.
 
         :raises CannotDraw: without a working graphics library
-        :raises ValueError: where the task draws no frame
+        :raises ValueError: where the task draws no frames, as it says in its metadata or shows
         """
         rate = env.metadata.get("render_fps") or self.fps  # control steps a second
         self.fps = min(self.fps, rate)
@@ -84,11 +84,15 @@ class Video:
         if due < self.frames:
             return
         if self.frames == 0:
+            if "rgb_array" not in (modes := env.metadata.get("render_modes", ["rgb_array"])):
+                raise ValueError(f"'rgb_array' is none of the render_modes in the task's metadata: {modes}.")
             follow(env)
         try:
             frame: Any = env.render()
         except Exception as error:
-            raise CannotDraw(error) from error
+            if isinstance(error, (ImportError, OSError)) or hasattr(getattr(env, "unwrapped", None), "mujoco_renderer"):
+                raise CannotDraw(error) from error
+            raise  # a fault of the task's own
         if np.ndim(frame) != 3:
             raise ValueError(
                 f"render() of the task returned {type(frame).__name__}, expected a frame, (height, width, 3) of uint8."

@@ -34,7 +34,13 @@ from sb3_said.files.normalization import load_normalization, normalization_file,
 from sb3_said.offline import BC, DQL, OfflineAlgorithm
 from sb3_said.offline.datasets import is_file
 from sb3_said.planner.config import SAMPLING_SETTINGS
-from sb3_said.zoo.answer import BEST_NAME, EXPERT_FOLDER, evaluate_answer, save_with_normalization
+from sb3_said.zoo.answer import (
+    BEST_NAME,
+    EXPERT_FOLDER,
+    StoppableEvaluation,
+    evaluate_answer,
+    save_with_normalization,
+)
 from sb3_said.zoo.arguments import Delay, ages_under, ending_training, largest_delay, reading_settings
 from sb3_said.zoo.folder import (
     claim_folder,
@@ -134,6 +140,7 @@ class DelayedExperimentManager(ExperimentManager):
                 raise ValueError(f"--{option} must be at least 1, got {number}.")
         self.run = run
         self.stopping = Stopping()
+        self.evaluation: StoppableEvaluation | None = None
         self._of_expert = True  # are the environments made now
         self._has_told = False  # that there is no delay
         self.lock: FileLock | None = None
@@ -337,19 +344,27 @@ class DelayedExperimentManager(ExperimentManager):
 
     def create_callbacks(self) -> None:
         super().create_callbacks()
-        self.evaluation = next((c for c in self.callbacks if isinstance(c, EvalCallback)), None)
-        self._set_evaluation()
-        if self.evaluation is not None:
-            file = normalization_file(Path(str(self.evaluation.best_model_save_path), BEST_NAME))
-            own = self.evaluation.callback_on_new_best  # of rl_zoo3, for its own tools
+        of_zoo = next((c for c in self.callbacks if isinstance(c, EvalCallback)), None)
+        if of_zoo is not None:
+            folder = self._evaluated_in()
+            own = of_zoo.callback_on_new_best  # of rl_zoo3, for its own tools
             assert own is not None
-            self.evaluation.callback_on_new_best = CallbackList([own, SaveNormalization(file)])
+            self.evaluation = StoppableEvaluation(
+                of_zoo.eval_env,
+                self.stopping,
+                callback_on_new_best=CallbackList([own, SaveNormalization(normalization_file(folder / BEST_NAME))]),
+                n_eval_episodes=of_zoo.n_eval_episodes,
+                eval_freq=of_zoo.eval_freq,
+                log_path=str(folder),
+                best_model_save_path=str(folder),
+                deterministic=of_zoo.deterministic,
+            )
+            self.callbacks[self.callbacks.index(of_zoo)] = self.evaluation
         self._add_checkpoints()
 
-    def _set_evaluation(self) -> None:
-        if self.evaluation is not None and self.algo == "said":
-            expert = self.folder / EXPERT_FOLDER
-            self.evaluation.log_path, self.evaluation.best_model_save_path = f"{expert}/evaluations", str(expert)
+    def _evaluated_in(self) -> Path:
+        """Return the folder of what is evaluated in training: of SAID its expert, which learns then."""
+        return self.folder / EXPERT_FOLDER if self.algo == "said" else self.folder
 
     def _add_checkpoints(self) -> None:
         self.checkpointing = TrainingCheckpointCallback(self.folder, self.run.checkpoint_freq, self.stopping)

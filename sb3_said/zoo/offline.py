@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -63,8 +64,8 @@ class OfflineExperimentManager(DelayedExperimentManager):
         self.n_envs = n_envs
         self.callbacks = [c for c in self.callbacks if not isinstance(c, ProgressBarCallback)]
 
-    def _set_evaluation(self) -> None:
-        pass  # there is no expert: it is the agent that is evaluated
+    def _evaluated_in(self) -> Path:
+        return self.folder  # there is no expert: it is the agent that is evaluated
 
     def _add_checkpoints(self) -> None:
         freq, stopping = self.run.checkpoint_freq, self.stopping

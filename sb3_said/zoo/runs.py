@@ -136,7 +136,11 @@ def load_run(
     unknown = [name for name in (own_algo or algo, algo or own_algo) if name not in ALGORITHMS]
     if unknown:  # an agent of SB3 itself would run code of its file
         names = ", ".join(ALGORITHMS)
-        raise ValueError(f"The algorithm of {file} is not known ({unknown[0]}): give --algo, one of {names}.")
+        told = f" ({unknown[0]})" if unknown[0] else ""
+        raise ValueError(
+            f"The algorithm of {file} is not known{told}: give --algo, one of {names}. What Stable-Baselines3 itself "
+            "has saved, sb3-said collect alone opens."
+        )
     if own_algo and algo not in (None, own_algo):
         warnings.warn(f"{file} is of {own_algo!r}, as it says itself: --algo {algo} changes nothing.", stacklevel=2)
     algo, env_id = str(own_algo or algo), env_id or own_task

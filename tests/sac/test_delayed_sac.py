@@ -216,8 +216,17 @@ def test_replay_is_saved_without_pickle(tmp_path):
         make(delayed(), buffer_size=20).load_replay_buffer(tmp_path / "replay.pkl")
 
     save_to_pkl(tmp_path / "pickled.pkl", model.replay_buffer)
-    with pytest.raises(ValueError, match="holds a pickle"):
+    with pytest.raises(
+        ValueError, match=r"holds a pickle.*Of a replay buffer, SAID\.learn_offline takes"
+    ):
         make().load_replay_buffer(tmp_path / "pickled.pkl")
+    with pytest.raises(SavedFileError, match="of kind 'replay buffer', where 'DelayedSAC' was expected"):
+        DelayedSAC.load(tmp_path / "replay.pkl")
+    model.save(tmp_path / "agent.zip")
+    with pytest.raises(SavedFileError, match="of kind 'DelayedSAC', where 'replay buffer' was expected"):
+        other.load_replay_buffer(tmp_path / "agent.zip")
+    save_tree(tmp_path / "of_before.pkl", model.replay_buffer.state_dict())
+    other.load_replay_buffer(tmp_path / "of_before.pkl")
     for state in ({}, [], {**model.replay_buffer.state_dict(), "rewards": 3}):
         save_tree(tmp_path / "forged", state)
         with pytest.raises(SavedFileError, match="Cannot load"):

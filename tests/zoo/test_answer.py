@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,11 +18,13 @@ from small_task import delayed
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
 from trained_run import ENV, PLANNER, train_run
 
 from sb3_said import SAID, DelayedObservationWrapper
 from sb3_said.evaluation.plots import plot_learning_curve
-from sb3_said.zoo.answer import evaluate_answer
+from sb3_said.sac import StableSAC
+from sb3_said.zoo.answer import StoppableEvaluation, evaluate_answer
 from sb3_said.zoo.stopping import Stopping
 
 EVALUATED = ("--eval-freq", "100", "--eval-episodes", "2")
@@ -52,6 +55,18 @@ def test_planner_and_expert_are_told_apart(logs: Path) -> None:
     best, of_expert = (SAID.load(folder / "best_model.zip", device="cpu") for folder in (said, said / "expert"))
     assert best.policy.planner_is_trained and not of_expert.policy.planner_is_trained
     assert "eval/answer_mean_reward" in (said / "progress.csv").read_text().splitlines()[0]
+
+
+@pytest.mark.parametrize("has_an_end", [True, False])
+def test_an_evaluation_whose_episode_may_have_no_end_is_warned_of(
+    has_an_end: bool, recwarn: pytest.WarningsRecorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(importlib.import_module("sb3_said.evaluation.rollout"), "LONG", 30)
+    venv = DummyVecEnv([lambda: Monitor(delayed(length=30 if has_an_end else 31))])
+    evaluation = StoppableEvaluation(venv, Stopping(), eval_freq=10, n_eval_episodes=1, verbose=0)
+    small_agent.make(cls=StableSAC).learn(10, callback=evaluation)
+    told = [str(w.message) for w in recwarn if "has not ended after 30 steps" in str(w.message)]
+    assert len(told) == (0 if has_an_end else 1)
 
 
 @pytest.mark.parametrize("max_steps", [1000, 150])

@@ -208,6 +208,9 @@ def test_an_agent_of_sb3_itself_is_not_opened(run: Path, tmp_path: Path) -> None
         for algo in (None, "sadr"):
             with pytest.raises(ValueError, match=r"is not known \(ppo\): give --algo, one of said, sac"):
                 load_run(tmp_path, algo=algo)
+    (tmp_path / "run.json").unlink()
+    with pytest.raises(ValueError, match=r"is not known: give .*has saved, sb3-said collect alone opens"):
+        load_run(tmp_path / "Pendulum-v1.zip")
     with pytest.warns(UserWarning, match="is of 'said', as it says itself: --algo bc changes nothing"):
         assert load_run(run, algo="bc", device="cpu").info["algo"] == "said"
 
@@ -382,6 +385,24 @@ def test_a_task_that_cannot_be_drawn_names_the_libraries(tmp_path: Path) -> None
 
     with pytest.raises(enjoy.CannotDraw, match=r"(?s)libEGL.*apt-get install libegl1"):
         enjoy.Video(tmp_path / "film.mp4", 25).on_step(Broken())
+
+
+def test_a_fault_of_the_tasks_own_drawing_stays_what_it_is(tmp_path: Path) -> None:
+    class Broken:
+        metadata: dict = {}
+
+        def render(self) -> None:
+            raise NameError("name 'scren' is not defined")
+
+    with pytest.raises(NameError, match="scren"):
+        enjoy.Video(tmp_path / "film.mp4", 25).on_step(Broken())
+
+
+def test_a_task_that_declares_no_pictures_is_told(tmp_path: Path) -> None:
+    env = gym.make("MountainCar-v0")  # whose own metadata are these
+    env.unwrapped.metadata = {"render_modes": ["ansi"]}
+    with pytest.raises(ValueError, match=r"'rgb_array' is none of the render_modes in the task's metadata: \['ansi'\]"):
+        enjoy.Video(tmp_path / "film.gif", 10).on_step(env)
 
 
 def test_enjoy_prints_every_episode(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],

@@ -14,11 +14,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rl_zoo3")
 
 from forked import begin, run_script
+from stable_baselines3.common.callbacks import EvalCallback
 from trained_run import ENV, NETWORKS, PLANNER
 
 from sb3_said import SAID
@@ -106,6 +108,29 @@ def test_a_signal_to_the_experts_training(
     train.main(["--resume", str(run)])
     assert "Resuming" in capsys.readouterr().out
     assert SAID.load(run / f"{ENV}.zip", device="cpu").num_timesteps == 150
+
+
+def test_a_signal_to_an_evaluation_breaks_it_off_and_the_resume_plays_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    evaluated = ("--eval-freq", "40", "--eval-episodes", "2", "--n-eval-envs", "1")
+    steps = []
+    with monkeypatch.context() as patch:
+        patch.setattr(EvalCallback, "_log_success_callback", lambda self, *_: steps.append(self.num_timesteps))
+        train.main(arguments(tmp_path / "counted", *evaluated))
+    with monkeypatch.context() as patch:
+        signal_at(patch, EvalCallback, "_log_success_callback", steps.index(80) + 2, signal.SIGTERM)
+        with pytest.raises(SystemExit) as stop:
+            train.main(arguments(tmp_path, *evaluated))
+    run = run_of(tmp_path)
+    assert stop.value.code == 130
+    assert "Interrupted at step 80 and wrote a checkpoint" in capsys.readouterr().out
+    file = run / "expert" / "evaluations.npz"
+    with np.load(file) as saved:
+        assert saved["timesteps"].tolist() == [40]
+    train.main(["--resume", str(run)])
+    with np.load(file) as saved:
+        assert saved["timesteps"].tolist() == [40, 81, 121]
 
 
 def test_a_signal_to_the_planners_training_loses_no_update(
