@@ -173,7 +173,7 @@ def returns(players: dict[str, Any], args: argparse.Namespace) -> dict[str, list
                 return DelayedObservationWrapper(gym.make(args.env), delay, max_delay=args.max_delay)
 
             played = rollout(player, make_env, args.episodes, args.eval_seed, args.n_envs)
-            table[name].append(Summary.from_episodes(name, played.returns, played.lengths))
+            table[name].append(played.summary(name))
     return table
 
 

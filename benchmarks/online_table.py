@@ -29,7 +29,8 @@ import numpy as np
 from measure import print_table
 
 from sb3_said.evaluation import Interval, confidence_interval, plots, stratified_interval
-from sb3_said.zoo.cells import Cell, Results, manners_of
+from sb3_said.zoo.cells import Cell, Results
+from sb3_said.zoo.tables import manners_of
 
 #: Rows of Table 1 at delays 0, 4, 8 and 16.
 PAPER = {

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 
-from sb3_said.evaluation.statistics import Latency
+from sb3_said.evaluation.statistics import Latency, Summary
 
 if TYPE_CHECKING:
     from stable_baselines3.common.type_aliases import PolicyPredictor
@@ -36,10 +36,17 @@ class Rollout:
     """(n_episodes,) bool, whether the task ended the episode (in MuJoCo's, by a fall), and no time limit"""
     action_changes: np.ndarray
     """(n_episodes,) float64, mean |a_t - a_{t-1}| over steps and entries, in halves of the action space's range"""
-    call_seconds: np.ndarray
-    """(n_calls,) float64, wall time of each call of ``predict``"""
-    batch_sizes: np.ndarray
-    """(n_calls,) int64, decisions made by each call"""
+    successes: np.ndarray | None
+    """(n_episodes,) bool, ``info["is_success"]`` at each episode's end; None of a task that does not tell it"""
+
+    def summary(self, label: str, latency: Latency | None = None) -> Summary:
+        """Return a row of an evaluation.
+
+        :param label: who answered
+        :param latency: of single decisions, if it was measured
+        """
+        measured = latency, self.terminated, self.action_changes, self.successes
+        return Summary.from_episodes(label, self.returns, self.lengths, *measured)
 
 
 def rollout(
@@ -79,8 +86,7 @@ def rollout(
     returns, lengths = np.zeros(n_episodes), np.zeros(n_episodes, np.int64)
     ended, changes = np.zeros(n_episodes, bool), np.zeros(n_episodes)
     before: dict[int, np.ndarray] = {}  # the last action of each episode that is played
-    call_seconds: list[float] = []
-    batch_sizes: list[int] = []
+    successes: list[bool | None] = [None] * n_episodes
     envs = _make_all(env, min(n_envs, n_episodes))
     half_range = _half_range(envs[0].action_space)
     try:
@@ -92,14 +98,11 @@ def rollout(
             batch = normalize(batch)
             episode_start = np.array([lengths[episode] == 0 for _, episode, _ in playing])
 
-            began = time.perf_counter()
             actions, state = model.predict(batch, state=state, episode_start=episode_start, deterministic=deterministic)
-            call_seconds.append(time.perf_counter() - began)
-            batch_sizes.append(len(playing))
 
             going_on = {}  # by the row in this batch
             for row, (e, episode, _) in enumerate(playing):
-                observation, reward, terminated, truncated, _ = e.step(actions[row])
+                observation, reward, terminated, truncated, info = e.step(actions[row])
                 returns[episode] += float(reward)
                 lengths[episode] += 1
                 ended[episode] = terminated
@@ -111,6 +114,7 @@ def rollout(
                 if on_step is not None:
                     on_step(e)
                 if terminated or truncated:
+                    successes[episode] = info.get("is_success")
                     returns[episode] = _monitored(e, returns[episode])
                     if not np.isfinite(returns[episode]):
                         raise ValueError(
@@ -131,7 +135,7 @@ def rollout(
         for e in envs:
             e.close()
     changes /= np.maximum(lengths - 1, 1)
-    return Rollout(returns, lengths, ended, changes, np.array(call_seconds), np.array(batch_sizes, np.int64))
+    return Rollout(returns, lengths, ended, changes, None if None in successes else np.array(successes, bool))
 
 
 def warn_if_long(steps: int, episode: str = "An episode") -> None:

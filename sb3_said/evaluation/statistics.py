@@ -77,6 +77,8 @@ class Summary:
     """episodes that the task ended (in MuJoCo's, by a fall), and no time limit"""
     mean_action_change: Interval | None = None
     """mean |a_t - a_{t-1}| in halves of the action space's range: how rough the motion is"""
+    successes: int | None = None
+    """episodes that the task called one at their end"""
 
     @classmethod
     def from_episodes(
@@ -87,6 +89,7 @@ class Summary:
         latency: Latency | None = None,
         terminated: npt.ArrayLike | None = None,
         action_changes: npt.ArrayLike | None = None,
+        successes: npt.ArrayLike | None = None,
     ) -> Summary:
         """Summarise whole episodes.
 
@@ -96,6 +99,7 @@ class Summary:
         :param latency: of single decisions, if it was measured
         :param terminated: (n_episodes,) bool, if it is known
         :param action_changes: (n_episodes,), if they were measured
+        :param successes: (n_episodes,) bool, if the task tells them
         """
         return cls(
             label=label,
@@ -107,6 +111,7 @@ class Summary:
             worst_tenth=worst_tenth(returns),
             terminations=None if terminated is None else int(np.sum(terminated)),
             mean_action_change=None if action_changes is None else confidence_interval(action_changes),
+            successes=None if successes is None else int(np.sum(successes)),
         )
 
     def to_dict(self) -> dict[str, Any]:

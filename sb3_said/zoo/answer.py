@@ -19,7 +19,6 @@ from sb3_said.files.atomic import replacing
 from sb3_said.files.normalization import normalization_file, save_normalization
 from sb3_said.zoo.stopping import Stopping
 
-
 BEST_NAME = "best_model.zip"  # of the agent that did best in training, as SB3's EvalCallback names it
 EXPERT_FOLDER = "expert"  # in the run's: what EvalCallback wrote while the expert learned
 

@@ -139,6 +139,9 @@ def measure(args: argparse.Namespace, runs: dict[str, LoadedRun], target: Path, 
                     played.append((which, summary))
                     counted[label_of(which, summary)] = counts
     print_table(played, run.scored_task)
+    for which, summary in played:
+        if summary.successes is not None:
+            print(f"{label_of(which, summary)}: {summary.successes} of {len(summary.returns)} episodes were a success")
     for label, counts in counted.items():
         print(f"{label}: {', '.join(f'{name} {value:g}' for name, value in counts.items() if 'gap' not in name)}")
 
@@ -177,8 +180,7 @@ def evaluate(
         observations = collect_observations(run.make_env, min(latency_calls, 100), seed)
         with answering(run.model, answer):
             latency = measure_latency(run.model, observations, latency_calls, deterministic, run.normalize)
-    measured = played.terminated, played.action_changes
-    return Summary.from_episodes(label, played.returns, played.lengths, latency, *measured)
+    return played.summary(label, latency)
 
 
 def label_of(which: str, summary: Summary) -> str:

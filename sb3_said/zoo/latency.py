@@ -41,5 +41,5 @@ def evaluate_in_real_time(
                 simulate=lambda seconds: math.ceil(seconds / period),
             )
             played = rollout(LoopedModel(loop), run.make_env, n_episodes, seed, on_episode=lambda *_: bar.update())
-        rows.append((Summary.from_episodes(label, played.returns, played.lengths), loop.statistics().to_dict()))
+        rows.append((played.summary(label), loop.statistics().to_dict()))
     return rows

@@ -28,19 +28,10 @@ from sb3_said.delays.text import age_range, make_process
 from sb3_said.evaluation import Summary, plots
 from sb3_said.files.atomic import check_writable
 from sb3_said.zoo.arguments import TRUST, add_playing, check_positive, explained, make_parser, read_delay
-from sb3_said.zoo.cells import (
-    AGE,
-    Cell,
-    Results,
-    make_table,
-    print_manners,
-    print_scores,
-    print_seeds,
-    print_table,
-    unpaired,
-)
+from sb3_said.zoo.cells import AGE, Cell, Results
 from sb3_said.zoo.runs import ANSWERS, LoadedRun, answers, delay_name, load_run, longest_delay, origin
 from sb3_said.zoo.stopping import holding_back_ctrl_c, shield
+from sb3_said.zoo.tables import make_table, print_manners, print_scores, print_seeds, print_table, unpaired
 
 EPILOG = f"""\
 examples:
@@ -418,6 +409,4 @@ def play(
         run = load_run(cell.file, cell.algo, env_id, cell.delay, device, gym_packages=gym_packages, answer=cell.answer)
         if digest_of(run) != cell.sha256:
             raise ValueError(f"{cell.file} has changed since this call began: give the command again.")
-        played = run.play(episodes, seed, n_envs, age_error=cell.age_error, answer=cell.answer)
-    measured = played.terminated, played.action_changes
-    return Summary.from_episodes(cell.agent, played.returns, played.lengths, None, *measured)
+        return run.play(episodes, seed, n_envs, age_error=cell.age_error, answer=cell.answer).summary(cell.agent)

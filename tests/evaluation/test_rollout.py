@@ -91,10 +91,26 @@ def test_returns_are_those_of_a_loop_by_hand_whatever_the_number_of_environments
     np.testing.assert_allclose(result.returns, returns, rtol=1e-12)
     np.testing.assert_array_equal(result.lengths, lengths)
     # Every decision belongs to an episode that counts: no environment is stepped for nothing.
-    assert sum(model.batches) == sum(lengths) == result.batch_sizes.sum()
-    assert model.batches == result.batch_sizes.tolist()
+    assert sum(model.batches) == sum(lengths)
     assert max(model.batches) == min(n_envs, 13)
-    assert result.call_seconds.shape == result.batch_sizes.shape and np.all(result.call_seconds > 0)
+    assert result.successes is None and result.summary("x").successes is None  # of which the task says nothing
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_successes_are_those_of_each_episodes_end(n_envs: int) -> None:
+    class Goal(Countdown):
+        def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+            *rest, done, truncated, _ = super().step(action)
+            return *rest, done, truncated, {"is_success": np.bool_(done and self.is_even)}
+
+        def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict]:
+            made = super().reset(**kwargs)
+            self.is_even = self.left % 2 == 0
+            return made
+
+    result = rollout(Model(), Goal, 13, SEED, n_envs)
+    np.testing.assert_array_equal(result.successes, result.lengths % 2 == 0)
+    assert result.summary("x").successes == np.sum(result.lengths % 2 == 0) > 0
 
 
 class Waves(Countdown):

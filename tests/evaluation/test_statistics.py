@@ -182,6 +182,7 @@ def test_a_summary_has_each_of_its_numbers_from_its_own_column() -> None:
     assert summary.mean_action_change == confidence_interval(returns / 100)
     assert (summary.worst_tenth, summary.terminations) == (1.0, 4)
     assert Summary.from_episodes("x", returns, lengths).terminations is None
+    assert Summary.from_episodes("x", returns, lengths, successes=~ends).successes == 26
 
 
 def test_the_worst_tenth() -> None:

@@ -216,9 +216,7 @@ def test_replay_is_saved_without_pickle(tmp_path):
         make(delayed(), buffer_size=20).load_replay_buffer(tmp_path / "replay.pkl")
 
     save_to_pkl(tmp_path / "pickled.pkl", model.replay_buffer)
-    with pytest.raises(
-        ValueError, match=r"holds a pickle.*Of a replay buffer, SAID\.learn_offline takes"
-    ):
+    with pytest.raises(ValueError, match=r"holds a pickle.*Of a replay buffer, SAID\.learn_offline takes"):
         make().load_replay_buffer(tmp_path / "pickled.pkl")
     with pytest.raises(SavedFileError, match="of kind 'replay buffer', where 'DelayedSAC' was expected"):
         DelayedSAC.load(tmp_path / "replay.pkl")
