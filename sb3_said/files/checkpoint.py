@@ -90,6 +90,8 @@ class TrainingCheckpointCallback(BaseCallback):
     :param keeps_replay: False writes a checksum of the replay instead, where it is a dataset that a resume reads again
     """
 
+    model: SafeSaveMixin
+
     def __init__(
         self,
         folder: str | Path,
@@ -110,7 +112,6 @@ class TrainingCheckpointCallback(BaseCallback):
         is_there = self.path.exists()
         self._saved_at = self._tried_at if self._tried_at > 0 and is_there and self._is_own() else -1
         self._clock.wait()
-        assert isinstance(self.model, SafeSaveMixin)
         # A resume makes an agent anew: it has the replay that this one was given from nowhere else, and would take a
         # checkpoint that another run has left in this folder
         if self._saved_at < 0 and (is_there or (self.keeps_replay and _replay_buffer(self.model).size() > 0)):
@@ -124,7 +125,6 @@ class TrainingCheckpointCallback(BaseCallback):
             return False
 
     def _now(self) -> list[int]:
-        assert isinstance(self.model, SafeSaveMixin)
         weights = self.model.policy.state_dict().values()
         return [self.model.num_timesteps, crc32(x.numpy(force=True) for x in weights)]
 
@@ -152,7 +152,6 @@ class TrainingCheckpointCallback(BaseCallback):
 
         :raises ValueError: for a run that has gone wrong, whose state is not finite; the one before stays
         """
-        assert isinstance(self.model, SafeSaveMixin)
         self._tried_at = self.model.num_timesteps
         if self._tried_at != self._saved_at:
             state = training_state(self.model, self.locals.get("callback"), self.keeps_replay)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -62,6 +63,14 @@ def worse_than_regression(errors: dict[str, float], tolerance: float = 0.05) -> 
         for name, bar in bars.items()
         if errors[name] > (1 + tolerance) * bar
     )
+
+
+@contextmanager
+def seeded(seed: int) -> Iterator[None]:
+    """Draw weights from a seed inside the context; torch's global generator of the CPU stays as it was."""
+    with th.random.fork_rng(devices=[]):
+        th.default_generator.manual_seed(seed)  # th.manual_seed would seed GPUs, too
+        yield
 
 
 class PlannerTrainer:
@@ -126,11 +135,11 @@ class PlannerTrainer:
         values = scaled_values(training_source.values, self.config.value_scale)
         self.source = replace(training_source, values=values).to(self.device)
         self.older = older
-        self.guess_steps = guess_steps
+        self.guess_steps = guess_steps  # of no setting above: no update after the first reads it
+        self._has_guess = False
         self._is_own = self.config.mask == "own" and source.ages is not None
         sizes = planner.obs_dim, planner.act_dim, planner.max_delay
-        with th.random.fork_rng(devices=[]):  # initial weights are the only draws that take no generator
-            th.default_generator.manual_seed(seed)  # th.manual_seed would seed GPUs, too
+        with seeded(seed):  # initial weights are the only draws that take no generator
             self.average = InpaintingPlanner(*sizes, self.config).to(self.device).requires_grad_(False)
             self.yardstick = RegressionYardstick(*sizes).to(self.device)
         windows = self.source.sample(N_NORMALIZER_WINDOWS, planner.window_length, self.generator)
@@ -188,8 +197,7 @@ class PlannerTrainer:
         :return: whether there is one, or none is asked for; False where ``should_stop`` has ended it
         """
         guess, older, self.older = self.online.first_guess, self.older, None  # older: another copy of the replay
-        prior = self.online.prior
-        if guess is None or prior is None or self.n_updates > 0 or prior.is_fitted:
+        if guess is None or self._has_guess:
             return True
         guess.requires_grad_(True)  # which one that was taken back has not
         passes = -(-GUESS_PASSES * len(self.source) // GUESS_BATCH_SIZE)
@@ -230,6 +238,7 @@ class PlannerTrainer:
             windows = self.source.gather(every, self.online.window_length)
         self.online.fit_prior(windows)
         self.average.load_state_dict(self.online.state_dict())
+        self._has_guess = True
 
     def _descend(self) -> tuple[th.Tensor]:
         """Draw a batch, move both sets of weights, and return both losses, (2,), without waiting for the device."""
@@ -348,6 +357,8 @@ class PlannerTrainer:
         self.n_updates = state["n_updates"]
         for name, module in self._modules.items():
             module.load_state_dict(state[name])
+        prior = self.online.prior
+        self._has_guess = self.n_updates > 0 or (prior is not None and prior.is_fitted)
         for name, optimizer in self._optimizers.items():
             optimizer.load_state_dict({**optimizer.state_dict(), "state": state[name]})
         drawn = state["generator"].cpu()

@@ -264,8 +264,8 @@ class DelayedReplayBuffer(ReplayBuffer):
         dones = (self.dones[rows, envs] * (1 - self.timeouts[rows, envs])).reshape(-1, 1)
         rewards = self._normalize_reward(self.rewards[rows, envs].reshape(-1, 1), env)
         if not self.is_delayed:
-            data = (self._normalize_obs(states, env), actions, self._normalize_obs(next_states, env), dones, rewards)
-            return ReplayBufferSamples(*(self.to_torch(np.asarray(part)) for part in data))
+            data = (self.normalized(states, env), actions, self.normalized(next_states, env), dones, rewards)
+            return ReplayBufferSamples(*map(self.to_torch, data))
 
         ages = self.ages[rows, envs]
         if self.relabelled_ages > 0.0:
@@ -332,10 +332,8 @@ class DelayedReplayBuffer(ReplayBuffer):
     def _to_observation(
         self, obs: dict[str, np.ndarray], states: np.ndarray, env: VecNormalize | None
     ) -> dict[str, th.Tensor]:
-        if env is not None:
-            states = self.normalized(states, env)
-            obs = {**obs, "observation": self.normalized(obs["observation"], env)}
-        return {key: self.to_torch(value) for key, value in {**obs, UNDELAYED: states}.items()}
+        scaled = {"observation": self.normalized(obs["observation"], env), UNDELAYED: self.normalized(states, env)}
+        return {key: self.to_torch(value) for key, value in {**obs, **scaled}.items()}
 
     # ------------------------------------------------------------------------------------------------ windows
 
@@ -386,8 +384,10 @@ class DelayedReplayBuffer(ReplayBuffer):
             states[part] = self.normalized(self.observations[part], env)
         return states
 
-    def normalized(self, states: np.ndarray, env: VecNormalize) -> np.ndarray:
-        """Return states (..., obs_dim) as the expert's observations are normalised."""
+    def normalized(self, states: np.ndarray, env: VecNormalize | None) -> np.ndarray:
+        """Return states (..., obs_dim) as ``env`` normalises observations; without it, as they are."""
+        if env is None:
+            return states
         obs: Any = env.normalize_obs({"observation": states} if self.is_delayed else states)
         return obs["observation"] if self.is_delayed else obs
 

@@ -8,7 +8,7 @@ import pathlib
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -86,6 +86,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
     counters = (*SafeSaveMixin.counters, "trained_ages")
     own_classes = (DelayedReplayBuffer,)
     learns_from_logs: ClassVar[bool] = False
+    action_space: spaces.Box
     policy: DelayedSACPolicy
     replay_buffer: DelayedReplayBuffer
     _left_at: list[tuple[int, int]] | None = None  # what Monitors of a task without delay had counted
@@ -136,7 +137,8 @@ class DelayedSAC(SafeSaveMixin, SAC):
         for setting in [name for name in RANGES if hasattr(self, name)]:
             value = getattr(self, setting)
             check_argument(setting, value, type(self))
-            if isinstance(value, float) and declared(setting, type(self)) is int:
+            hint = declared(setting, type(self))
+            if isinstance(value, float) and int in (hint, *get_args(hint)) and float not in get_args(hint):
                 setattr(self, setting, int(value))  # such as 1e6
         own, given = {*self._policy_flags(), "relabelled_ages"}, {*self.policy_kwargs, *self.replay_buffer_kwargs}
         if twice := sorted(own & given):
@@ -260,7 +262,6 @@ class DelayedSAC(SafeSaveMixin, SAC):
             if self._vec_normalize_env is not None:
                 self._last_original_obs = self._vec_normalize_env.get_original_obs()
         action, scaled = super()._sample_action(*args, **kwargs)
-        assert isinstance(self.action_space, spaces.Box)  # as check_spaces says
         is_whole = holds_whole_numbers(self.action_space)  # then what is stored is what the task was sent
         return action, self.policy.scale_action(action) if is_whole else scaled
 

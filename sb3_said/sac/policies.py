@@ -52,6 +52,8 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
     :raises ValueError: for other spaces, or when a features extractor is given or shared in a delayed task
     """
 
+    action_space: spaces.Box
+
     def __init__(
         self,
         observation_space: spaces.Space[Any],
@@ -193,17 +195,14 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
             largest = max(float(np.abs(part).max(initial=0.0)) for part in parts)
             raise ValueError(f"{NOT_FINITE} The largest entry of the observation is {largest:.3g}.")
         space = self.action_space
-        assert isinstance(space, spaces.Box)  # as check_spaces says
         return np.clip(actions, space.low, space.high)  # scaling to the bounds may round to beyond them
 
     def scale_action(self, action: np.ndarray) -> np.ndarray:
         space = self.action_space
-        assert isinstance(space, spaces.Box)  # as check_spaces says
         return scale_action(action, space) if holds_whole_numbers(space) else super().scale_action(action)
 
     def unscale_action(self, scaled_action: np.ndarray) -> np.ndarray:
         space = self.action_space
-        assert isinstance(space, spaces.Box)
         is_whole = holds_whole_numbers(space)  # which SB3 leaves as fractions, in a type that may not hold the range
         return unscale_action(scaled_action, space) if is_whole else super().unscale_action(scaled_action)
 

@@ -18,7 +18,7 @@ from sb3_said.files.normalization import get_statistics, set_statistics
 from sb3_said.offline import IQL, ImplicitValues, OfflineAlgorithm, load_dataset
 from sb3_said.planner import InpaintingPlanner
 from sb3_said.planner.checks import check_intervals, whole
-from sb3_said.planner.trainer import PlannerTrainer
+from sb3_said.planner.trainer import PlannerTrainer, seeded
 from sb3_said.planner.values import returns_to_go
 from sb3_said.said.policies import SAIDPolicy, Value
 from sb3_said.said.training import PlannerTraining
@@ -277,8 +277,7 @@ class PlannerLearner(OfflineAlgorithm):
         if env is not None:  # V reads states as the planner has them
             normalized = self.replay_buffer.normalized
             data = replace(data, states=normalized(data.states, env), finals=normalized(data.finals, env))
-        with th.random.fork_rng(devices=[]):
-            th.default_generator.manual_seed(self.seed or 0)
+        with seeded(self.seed or 0):
             sizes = data.states.shape[1], data.actions.shape[1]
             values = ImplicitValues(*sizes, self.policy.iql_config).to(self.device)
         return IQL(values, data, self.gamma, self.seed or 0)

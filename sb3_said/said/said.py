@@ -9,7 +9,6 @@ from dataclasses import asdict, fields, replace
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
-import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
@@ -21,6 +20,7 @@ from sb3_said.offline import IQLConfig, OfflineAlgorithm
 from sb3_said.offline.learning import listed
 from sb3_said.planner.checks import whole
 from sb3_said.planner.config import SAMPLING_SETTINGS, WEIGHT_SETTINGS, PlannerConfig
+from sb3_said.planner.trainer import seeded
 from sb3_said.sac import StableSAC
 from sb3_said.sac.policies import settings_of
 from sb3_said.said.callbacks import PlannerTrainingCallback
@@ -330,8 +330,7 @@ class SAID(PlannerLearner, StableSAC):
         if self.env is None and (self.replay_buffer is None or self.replay_buffer.size() == 0):
             raise ValueError("Nothing to learn from: the replay is empty, as after load(); give load(..., env=env).")
         before = self.policy.student
-        with th.random.fork_rng(devices=[]):
-            th.default_generator.manual_seed(self.seed or 0)
+        with seeded(self.seed or 0):
             self.policy.make_student(width)
             try:
                 error = distill(self, config, progress_bar)

@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from tqdm.auto import tqdm
 
 from sb3_said.delays.space import KEYS, check_spaces
-from sb3_said.planner.checks import check_settings
+from sb3_said.planner.checks import check_settings, whole
 from sb3_said.planner.plain import ZScored, plain_network
 from sb3_said.replay.windows import WindowSource
 from sb3_said.sac.extractors import StateAugmentedExtractor
@@ -67,8 +67,7 @@ class Student(ZScored):
     preferred: th.Tensor
 
     def __init__(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any], width: int):
-        if width < 1:
-            raise ValueError(f"student_width is {width}, expected at least 1.")
+        width = whole("student_width", width)
         state_space, action_box, max_delay = check_spaces(observation_space, action_space)
         reader = StateAugmentedExtractor(observation_space) if isinstance(observation_space, spaces.Dict) else None
         n_inputs, act_dim = reader.features_dim if reader else state_space.shape[0], action_box.shape[0]

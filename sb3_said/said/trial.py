@@ -247,6 +247,29 @@ def gains_more_than_its_error(returns: np.ndarray, than: np.ndarray) -> bool:
     return bool(gain.mean() > error)
 
 
+def best_answer(trial: Trial) -> tuple[str, float, bool]:
+    """Return the way to decide that did best, the age that parts planner and expert, and whether the expert is below.
+
+    If the best way gains no more than its error over some, the first of these is taken. Both answer only if that
+    :func:`gains_more_than_its_error` over the better of the two.
+
+    :return: the age is -1 where the planner alone answers, and infinite where the expert does
+    """
+    expert = trial.returns["expert"]
+    played = {name: returns for name, returns in trial.returns.items() if len(returns) == len(expert)}
+    ways = [name for name in played if name != "expert"]
+    shares = {name: best_share(played[name], expert, trial.ages) for name in ways}
+    alone = max(played, key=lambda name: played[name].mean())
+    way = max(ways, key=lambda name: shares[name][0])
+    _, cut, is_below = shares[way]
+    together = np.where((trial.ages <= cut) == is_below, expert, played[way])
+    if gains_more_than_its_error(together, played[alone]):
+        return way, cut, is_below
+    best = played[max(ways, key=lambda name: played[name].mean())]
+    way = next(name for name in ways if not gains_more_than_its_error(best, played[name]))
+    return way, (np.inf if alone == "expert" else -1.0), True
+
+
 def let_the_best_answer(
     model: SAID,
     n_episodes: int,
@@ -257,8 +280,7 @@ def let_the_best_answer(
 ) -> dict[str, float | str]:
     """Let the planner in its best way answer, or the expert, or both, each at the ages at which it does better.
 
-    If the best way gains no more than its error over some, the first of these in ``planner_ways`` is taken. Both answer
-    only if that :func:`gains_more_than_its_error` over the better of the two. Warn where the expert alone answers.
+    Who that is, :func:`best_answer` says. Warn where the expert alone answers.
 
     :param planners: beside the agent's own, as of :func:`play_trial`; the agent takes the one of the best way
     :param make_env: as of :func:`play_trial`
@@ -266,18 +288,7 @@ def let_the_best_answer(
     """
     own, players = (model.policy.planner, model.policy.planner.config), players_of(model, planners)
     trial = play_trial(model, n_episodes, progress_bar, should_stop, planners, make_env)
-    expert = trial.returns["expert"]
-    played = {name: returns for name, returns in trial.returns.items() if len(returns) == len(expert)}
-    ways = [name for name in played if name != "expert"]
-    shares = {name: best_share(played[name], expert, trial.ages) for name in ways}
-    alone = max(played, key=lambda name: played[name].mean())
-    way = max(ways, key=lambda name: shares[name][0])
-    _, cut, is_below = shares[way]
-    together = np.where((trial.ages <= cut) == is_below, expert, played[way])
-    if not gains_more_than_its_error(together, played[alone]):
-        best = played[max(ways, key=lambda name: played[name].mean())]
-        way = next(name for name in ways if not gains_more_than_its_error(best, played[name]))
-        cut, is_below = (np.inf if alone == "expert" else -1.0), True
+    way, cut, is_below = best_answer(trial)
     model.policy.take_planner(*players.get(way, own))
     if 0 <= cut < model.policy.max_delay:
         model.set_answer("both", **({"expert_up_to": int(cut)} if is_below else {"expert_from": int(cut) + 1}))
@@ -285,9 +296,10 @@ def let_the_best_answer(
         model.set_answer("planner" if cut < 0 else "expert")
     if np.isinf(cut):
         warnings.warn(
-            f"The planner is worse than its expert: mean returns of {played[way].mean():.5g} and "
-            f"{expert.mean():.5g} over {n_episodes} episodes each. So the expert answers. More planner_gradient_steps "
-            "or more data may mend the planner; set_answer('planner') lets it answer all the same.",
+            f"The planner is worse than its expert: mean returns of {trial.returns[way].mean():.5g} and "
+            f"{trial.returns['expert'].mean():.5g} over {n_episodes} episodes each. So the expert answers. More "
+            "planner_gradient_steps or more data may mend the planner; set_answer('planner') lets it answer all the "
+            "same.",
             stacklevel=3,
         )
     means = {f"trial/{name}_return": float(returns.mean()) for name, returns in trial.returns.items()}

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch as th
 from filelock import FileLock, Timeout
 from stable_baselines3.common.logger import Logger, make_output_format
 
@@ -15,6 +14,7 @@ from sb3_said.files.archive import load_tree, readable, save_tree
 from sb3_said.files.checkpoint import crc32
 from sb3_said.files.checks import check_tensors
 from sb3_said.planner.checks import check_same
+from sb3_said.planner.trainer import seeded
 from sb3_said.said import SAID
 from sb3_said.said.training import planner_checkpoint
 from sb3_said.zoo.folder import log_suffix, resuming
@@ -105,8 +105,7 @@ class DepthPlanners:
     def _train(self, depth: int) -> None:
         planner = self._own
         if planner is None or planner.config.depth != depth:
-            with th.random.fork_rng(devices=[]):  # the same weights to begin with, whichever worker trains them
-                th.default_generator.manual_seed(self.model.seed or 0)
+            with seeded(self.model.seed or 0):  # the same weights to begin with, whichever worker trains them
                 self.model.policy.make_planner(replace(self.config, depth=depth))
             self._load_replay()
             self._update_planner(depth)

@@ -251,10 +251,20 @@ def with_delay(own: Any, delay: Delay, other: Delay = None) -> list[Any]:
     listed = list(own) if isinstance(own, list) else [own] if own else []
     if delay is None:
         return listed
-    if "DelayedObservationWrapper" in str(listed):
+    if any(is_delays(entry_of(wrapper)[0]) for wrapper in listed):
         raise ValueError(f"The delay is given twice, as --delay {delay} and in env_wrapper={listed}; leave one out.")
     largest = {} if other is None else {"max_delay": max(largest_delay(delay), largest_delay(other))}
     return [*listed, {WRAPPER: {"delay": delay, **largest}}]
+
+
+def entry_of(wrapper: Any) -> tuple[Any, dict[str, Any]]:
+    """Return name and arguments of an entry of rl_zoo3's ``env_wrapper``."""
+    return next(iter(wrapper.items())) if isinstance(wrapper, dict) else (wrapper, {})
+
+
+def is_delays(name: Any) -> bool:
+    """Tell whether a wrapper's name, or class, is the delay's."""
+    return "DelayedObservationWrapper" in str(name)
 
 
 def named_classes(given: Any, base: type) -> list[tuple[str, dict[str, Any]]]:
@@ -265,8 +275,7 @@ def named_classes(given: Any, base: type) -> list[tuple[str, dict[str, Any]]]:
     :raises ValueError: for others
     """
     found = []
-    for entry in given if isinstance(given, list) else [given]:
-        name, kwargs = next(iter(entry.items())) if isinstance(entry, dict) else (entry, {})
+    for name, kwargs in map(entry_of, given if isinstance(given, list) else [given]):
         cls: Any = get_class_by_name(name) if isinstance(name, str) and "." in name else name
         if not (isinstance(cls, type) and issubclass(cls, base)):
             raise ValueError(f"{name!r:.80} is no class that derives from {base.__module__}.{base.__name__}.")

@@ -38,7 +38,7 @@ from sb3_said.said.policies import Answer
 from sb3_said.zoo.arguments import Delay, largest_delay
 from sb3_said.zoo.folder import find_agent, find_normalization, resuming
 from sb3_said.zoo.manager import ALGORITHMS, has_its_planner
-from sb3_said.zoo.record import ENDED_NAME, WRAPPER, Record, import_packages, make_wrapper
+from sb3_said.zoo.record import ENDED_NAME, WRAPPER, Record, entry_of, import_packages, is_delays, make_wrapper
 
 ANSWERS = get_args(Answer)
 DELAYS = {"delay", "max_delay", "state_history"}  # of the wrapper: what an agent plays under, and what it reads of it
@@ -210,9 +210,8 @@ def changes(env_kwargs: dict[str, Any], wrappers: list[Any]) -> dict[str, Any]:
     :param wrappers: as rl_zoo3's ``env_wrapper`` has them
     """
     changed: dict[str, Any] = {"env_kwargs": env_kwargs} if env_kwargs else {}
-    for name, given in _named(wrappers):
-        is_ours = "DelayedObservationWrapper" in str(name)
-        changed |= {x: given[x] for x in given.keys() - DELAYS} if is_ours else {str(name): given}
+    for name, given in map(entry_of, wrappers):
+        changed |= {x: given[x] for x in given.keys() - DELAYS} if is_delays(name) else {str(name): given}
     return changed
 
 
@@ -308,15 +307,10 @@ def _with_delay(wrappers: list[Any], delay: Delay, model: BaseAlgorithm) -> list
     kwargs: dict[str, Any] = {"delay": max_delay if delay is None else delay, "max_delay": max_delay}
     if has_state_history(model.observation_space):
         kwargs["state_history"] = True
-    given = _named(wrappers)
-    if not any("DelayedObservationWrapper" in str(name) for name, _ in given):
+    given = [entry_of(wrapper) for wrapper in wrappers]
+    if not any(is_delays(name) for name, _ in given):
         given.append((WRAPPER, {}))
-    return [{name: {**old, **kwargs} if "DelayedObservationWrapper" in str(name) else old} for name, old in given]
-
-
-def _named(wrappers: list[Any]) -> list[tuple[Any, dict[str, Any]]]:
-    """Return the names and arguments of wrappers, as rl_zoo3's ``env_wrapper`` has them."""
-    return [next(iter(w.items())) if isinstance(w, dict) else (w, {}) for w in wrappers]
+    return [{name: {**old, **kwargs} if is_delays(name) else old} for name, old in given]
 
 
 def _check_spaces(model: BaseAlgorithm, env: gym.Env[Any, Any], file: Path) -> None:

@@ -166,12 +166,12 @@ def test_older_steps_teach_the_model_and_not_the_clone():
     th.testing.assert_close(clones["both"], clones["newest alone"], atol=0.1, rtol=0)
 
 
-def make_trainer(gradient_steps: int = 12, **changes) -> PlannerTrainer:
+def make_trainer(gradient_steps: int = 12, n_episodes: int = 40, length: int = 20, **changes) -> PlannerTrainer:
     small = dict(depth=1, d_model=32, horizon=HORIZON, batch_size=16, warmup_steps=4)
     with th.random.fork_rng(devices=[]):
         th.manual_seed(0)
         planner = InpaintingPlanner(STATE_DIM, ACTION_DIM, D, PlannerConfig(**{**small, **changes}))
-    return PlannerTrainer(planner, make_source(40, 20), gradient_steps, guess_steps=D)
+    return PlannerTrainer(planner, make_source(n_episodes, length), gradient_steps, guess_steps=D)
 
 
 def test_a_training_with_it_resumes_bit_for_bit():
@@ -209,6 +209,18 @@ def test_it_is_made_once_and_then_stays():
     for planner in (trainer.planner, trainer.online):
         for name, weight in planner.first_guess.state_dict().items():
             assert th.equal(weight, made[name]), name
+
+
+def test_of_data_too_few_for_a_prior_it_is_made_once_too(monkeypatch: pytest.MonkeyPatch):
+    trainer, fits = make_trainer(n_episodes=1, length=L), []
+    assert len(trainer.source) < 10
+    monkeypatch.setattr(trainer_module, "fit_first_guess", lambda *_, **__: bool(fits.append(0)) or True)
+    trainer.make_first_guess()
+    trainer.step()
+    other = make_trainer(n_episodes=1, length=L)
+    other.take_first_guess(trainer.average)
+    other.step()
+    assert len(fits) == 1
 
 
 @pytest.mark.parametrize(("gradient_steps", "most"), [(2, 10**9), (1000, 30), (1000, 10**9)])

@@ -285,5 +285,5 @@ def test_a_setting_of_another_type_is_refused_by_its_name(name, given):
 
 
 def test_a_count_may_be_written_as_a_float():
-    model = make(cls=DelayedSAC, buffer_size=1e2, batch_size=16.0)
-    assert (model.buffer_size, model.batch_size) == (100, 16) and isinstance(model.buffer_size, int)
+    model = make(cls=DelayedSAC, buffer_size=1e2, batch_size=16.0, seed=3.0).learn(25)
+    assert (model.buffer_size, model.batch_size, model.seed) == (100, 16, 3) and isinstance(model.buffer_size, int)

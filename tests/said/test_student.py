@@ -270,10 +270,15 @@ def test_parameters_with_a_student_ask_for_one_of_its_width(width, own, taught, 
         assert np.array_equal(answer(model, obs), answer(taught, obs))
 
 
+def test_its_width_may_be_written_as_a_float():
+    space = delayed()
+    assert Student(space.observation_space, space.action_space, 16.0).network[0].out_features == 16
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"width": 0}, "student_width is 0"),
+        ({"width": 0}, "student_width must be a whole number, at least 1, got 0"),
         ({"batch_size": 0}, "batch_size is 0, expected at least 1"),
         ({"q_weight": -1.0}, "q_weight is -1.0, expected at least 0"),
         ({"n_labels": 1e2}, "n_labels is 100.0, expected a whole number"),
