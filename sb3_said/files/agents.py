@@ -51,7 +51,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
 
     Every argument of the constructor after ``policy, env`` must be an attribute of the same name. A subclass adds what
     it counts to ``counters``, to ``own_classes`` the classes that its constructor takes where none are given, and to
-    ``settings_arguments`` those of its arguments that are settings by name, of which ``load`` may be given some.
+    ``settings_arguments`` those of its arguments that are dicts of settings, which ``load`` merges entry by entry.
     """
 
     counters: ClassVar[tuple[str, ...]] = (

@@ -142,7 +142,7 @@ def space_from_data(node: Any) -> spaces.Space[Any]:
 
 
 def replaced(settings: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings in whose place others are given; of those that have names themselves, these alone."""
+    """Return the old values of what ``given`` changes; of a dict, of its changed entries alone."""
     others = {}
     for name, now in given.items():
         before = settings.get(name, now)
@@ -155,9 +155,9 @@ def replaced(settings: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
 
 
 def with_given(settings: dict[str, Any], given: dict[str, Any], nested: Iterable[str]) -> dict[str, Any]:
-    """Return settings with those given in their place.
+    """Return settings updated by ``given``.
 
-    :param nested: names of settings that have names themselves, of which each can be given alone
+    :param nested: names of settings that are dicts, merged entry by entry instead of replaced
     """
     for name in nested:
         before, now = settings.get(name), given.get(name)

@@ -132,7 +132,7 @@ class InpaintingPlanner(nn.Module):
         for d in range(self.max_delay + 1):
             delay = th.full((len(states),), d, device=self.device)
             guess = self.first_guess.windows(rolled, delay, length)
-            self.prior.fit(d, self._in_units(guess), clean, valid & self._within(delay, length))
+            self.prior.fit(d, self._normalized_guess(guess), clean, valid & self._within(delay, length))
 
     def loss(
         self,
@@ -183,7 +183,7 @@ class InpaintingPlanner(nn.Module):
         x = th.where(known, clean, alpha * clean + sigma * noise)
         with autocast(config.precision, device):
             output = self.network(x, self.network.context(clean, known, guess), self.network.modulations(t), valid)
-        output = self._from_prior(output.float(), x, self._expect(guess, delay), alpha, sigma)
+        output = self._prediction(output.float(), x, self._prior_of(guess, delay), alpha, sigma)
         target = diffusion.prediction_target(clean, noise, alpha, sigma, config.prediction)
         learned = valid[..., None] & ~known
         decision = th.arange(length, device=device) == delay[:, None]  # (B, L)
@@ -389,13 +389,13 @@ class InpaintingPlanner(nn.Module):
         modulations = network.modulations(times)  # (n_steps, 6 * depth + 2, d_model)
         guess = self._guess(given[..., : self.obs_dim], given[..., self.obs_dim :], delay, known)
         context = network.context(clean, known, guess)
-        expected = self._expect(guess, delay)
+        expected = self._prior_of(guess, delay)
         if expected is not None:
             expected = expected[0][:, None], expected[1][:, None]  # (B, 1, L, obs_dim + act_dim)
 
         def predict(x: th.Tensor, i: int) -> th.Tensor:
             output = network(x.flatten(0, 1), context, modulations[i], valid).float().view_as(x)
-            return self._from_prior(output, x, expected, steps[i].alpha, steps[i].sigma)
+            return self._prediction(output, x, expected, steps[i].alpha, steps[i].sigma)
 
         def impose(x: th.Tensor) -> th.Tensor:
             return th.where(known[:, None], clean[:, None], x)
@@ -463,16 +463,16 @@ class InpaintingPlanner(nn.Module):
         z = self.normalizer.normalize_states(states)
         return self.first_guess(z, actions, delay, known[..., 0], longest=z.shape[1] - self.config.horizon)
 
-    def _in_units(self, guess: th.Tensor) -> th.Tensor:
-        """Return what :meth:`_guess` returns as a window in the planner's units: (B, L, obs_dim + act_dim)."""
+    def _normalized_guess(self, guess: th.Tensor) -> th.Tensor:
+        """Return a guess of :meth:`_guess` in the planner's units: (B, L, obs_dim + act_dim)."""
         z, actions = guess.split(self.sizes, dim=-1)
         return self.normalizer.normalize(self.normalizer.denormalize_states(z), actions)
 
-    def _expect(self, guess: th.Tensor | None, delay: th.Tensor) -> tuple[th.Tensor, th.Tensor] | None:
+    def _prior_of(self, guess: th.Tensor | None, delay: th.Tensor) -> tuple[th.Tensor, th.Tensor] | None:
         """Return the prior's mean and standard deviation of each entry, (B, L, obs_dim + act_dim), if there is one."""
-        return None if self.prior is None or guess is None else self.prior(self._in_units(guess), delay)
+        return None if self.prior is None or guess is None else self.prior(self._normalized_guess(guess), delay)
 
-    def _from_prior(
+    def _prediction(
         self,
         output: th.Tensor,
         x: th.Tensor,
@@ -480,7 +480,7 @@ class InpaintingPlanner(nn.Module):
         alpha: float | th.Tensor,
         sigma: float | th.Tensor,
     ) -> th.Tensor:
-        """Return the prediction at noisy windows x, which the network gives as what the prior is off by."""
+        """Return the prediction at noisy windows x: the prior's best, and what the network says that it is off by."""
         if expected is None:
             return output
         best, off = diffusion.gaussian_prediction(x, *expected, alpha, sigma, prediction=self.config.prediction)

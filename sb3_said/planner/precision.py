@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager, nullcontext
 
 import torch as th
 
-#: Numbers in the activations, below which a CPU converts them for longer than bfloat16 saves in products
+#: Numbers in the activations; of fewer, on a CPU, the conversion to bfloat16 costs more than its products save
 SMALL = 48 * 128
 
 

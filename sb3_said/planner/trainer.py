@@ -266,8 +266,8 @@ class PlannerTrainer:
         return (th.stack((loss, yardstick_loss)).detach(),)
 
     def _draw_delays(self, mask: str) -> th.Tensor:
-        drawn = self.config.batch_size, self.average.max_delay, mask, self.config.mask_end_probability, self.generator
-        return draw_delays(*drawn).to(self.device)
+        c, max_delay = self.config, self.average.max_delay
+        return draw_delays(c.batch_size, max_delay, mask, c.mask_end_probability, self.generator).to(self.device)
 
     def train(
         self, n_steps: int | None = None, callback: Callable[[PlannerTrainer], bool | None] | None = None

@@ -318,14 +318,14 @@ class ControlLoop:
         ledger, counted = self._ledger, self._statistics
         counted.steps += 1
         if ledger.observation is not None:
-            counted.count(age=ledger.age)
+            counted.count_age(ledger.age)
         if n_missing > 0:
             counted.waiting_steps += not ledger.is_answered
             is_held = n_missing <= ledger.hold_steps
             counted.held_steps += ledger.is_answered and is_held
             counted.safe_steps += ledger.is_answered and not is_held
         if ledger.n_sent > 0:
-            counted.count(gap=(now - self._acted) / self.period)
+            counted.count_gap((now - self._acted) / self.period)
 
     def _work(self) -> None:
         """Answer until closed: the worker's thread."""
@@ -376,7 +376,7 @@ class ControlLoop:
             return
         if ledger.n_sent > 0 and not self._stands:  # else no step goes by however long an answer takes
             took = ledger.n_sent - request.n_sent
-            self._statistics.count(answer_steps=took)
+            self._statistics.count_answer(took)
             self._took.append(took)
             self._expect(sorted(self._took)[math.ceil(ANSWERS_COVERED * len(self._took)) - 1])
         if self.count_latency:

@@ -41,16 +41,19 @@ class LoopStatistics:
     """observations that were no younger than the one at hand (repeated by a frozen sensor, or overtaken), of another
     episode, or stamped ahead of now"""
 
-    def count(self, age: int | None = None, answer_steps: int | None = None, gap: float | None = None) -> None:
-        """Count one of each that is given."""
-        if age is not None:
-            self.ages[min(age, LARGEST_COUNTED)] += 1
-        if answer_steps is not None:
-            self.answer_steps[min(answer_steps, LARGEST_COUNTED)] += 1
-        if gap is not None:
-            gap = max(gap, 0.0)
-            self.gaps[round(gap, 3) if gap < 2 else float(round(min(gap, LARGEST_COUNTED)))] += 1
-            self.overruns += gap > 1.5
+    def count_age(self, age: int) -> None:
+        """Count the age, in control steps, of the newest observation when an action is sent."""
+        self.ages[min(age, LARGEST_COUNTED)] += 1
+
+    def count_answer(self, steps: int) -> None:
+        """Count an answer that took some control steps."""
+        self.answer_steps[min(steps, LARGEST_COUNTED)] += 1
+
+    def count_gap(self, periods: float) -> None:
+        """Count the time between two actions, in control periods."""
+        periods = max(periods, 0.0)
+        self.gaps[round(periods, 3) if periods < 2 else float(round(min(periods, LARGEST_COUNTED)))] += 1
+        self.overruns += periods > 1.5
 
     def copy(self) -> LoopStatistics:
         """Return a copy, which further counting does not change."""

@@ -17,6 +17,7 @@ def ticks(
     :param period: in seconds
     :param clock: steady, in seconds
     :param sleep: waits for some seconds
+    :raises ValueError: for a period that is not above 0
 
     >>> for _ in ticks(0.02):  # doctest: +SKIP
     ...     send(loop.act())

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import torch as th
 
-MET = 0.25  # of an even share of the decisions: an age that fewer were made at is too rare to imitate by itself
+COMMON = 0.25  # part of an even share of all decisions that an age needs, to be imitated by itself
 
 
 class Windows(NamedTuple):
@@ -27,6 +27,16 @@ class Windows(NamedTuple):
     def to(self, device: th.device | str) -> Windows:
         """Return these windows on a device."""
         return Windows(*(part.to(device) for part in self))
+
+
+class Seen(NamedTuple):
+    """What each decision was made on: the start that lies its age before it."""
+
+    starts: th.Tensor  # (n_starts,) int64, -1 where that is not stored
+    by_age: th.Tensor  # (n_stored + 1,) those that are, sorted by age, and a last one that stands for none
+    firsts: th.Tensor  # (n_ages,) where each age begins in by_age
+    sizes: th.Tensor  # (n_ages,) how many it has
+    is_common: th.Tensor  # (n_ages,) bool, whether windows are drawn by this age
 
 
 def mean_and_deviation(rows: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
@@ -115,23 +125,23 @@ class WindowSource:
         :param early_probability: as of :meth:`sample`, of decisions, whose age is then their own
         :return: windows, and the ages of their decisions, (B,)
         """
-        seen, by_age, firsts, sizes, is_met = self._seen
+        seen = self._seen
         drawn, is_early = self._draw(len(delay), generator, early_probability)
         place = th.rand(len(delay), generator=generator, device="cpu" if generator is None else generator.device)
-        age = delay.clamp(max=len(sizes) - 1)
-        step = (place.to(delay.device) * sizes[age]).long().clamp(max=sizes[age] - 1)
-        starts = th.where(is_met[age] & (delay == age), by_age[firsts[age] + step], drawn)
-        is_early = is_early & (seen[drawn] >= 0)
+        age = delay.clamp(max=len(seen.sizes) - 1)
+        step = (place.to(delay.device) * seen.sizes[age]).long().clamp(max=seen.sizes[age] - 1)
+        starts = th.where(seen.is_common[age] & (delay == age), seen.by_age[seen.firsts[age] + step], drawn)
+        is_early = is_early & (seen.starts[drawn] >= 0)
         assert self.ages is not None  # for mypy: _seen has read them
-        starts, delay = th.where(is_early, seen[drawn], starts), th.where(is_early, self.ages[drawn], delay)
+        starts, delay = th.where(is_early, seen.starts[drawn], starts), th.where(is_early, self.ages[drawn], delay)
         return self.gather(starts, length), delay
 
     def own_starts(self, age: int) -> th.Tensor:
         """Return the starts that decisions of an age were made on, and none where :meth:`sample_own` draws others."""
-        _, by_age, firsts, sizes, is_met = self._seen
-        if age >= len(sizes) or not is_met[age]:
-            return by_age[:0]
-        return by_age[int(firsts[age]) :][: int(sizes[age])]
+        seen = self._seen
+        if age >= len(seen.sizes) or not seen.is_common[age]:
+            return seen.by_age[:0]
+        return seen.by_age[int(seen.firsts[age]) :][: int(seen.sizes[age])]
 
     def _draw(
         self, batch_size: int, generator: th.Generator | None, early_probability: float
@@ -158,24 +168,20 @@ class WindowSource:
         return order, sizes.cumsum(0) - sizes, sizes
 
     @cached_property
-    def _seen(self) -> tuple[th.Tensor, th.Tensor, th.Tensor, th.Tensor, th.Tensor]:
-        """What each decision was made on: the start that lies its age before it, -1 where that is not here.
-
-        :return: these starts, (n_starts,); those that are here, by age; and of each age the first place there, their
-            number, and whether it is drawn
-        """
+    def _seen(self) -> Seen:
+        """What each decision was made on."""
         assert self.ages is not None  # for mypy: the callers have seen to it
         order, firsts, sizes = self._by_episode
         ages = self.ages[order]
         before = th.arange(len(order), device=order.device) - ages
         is_here = before >= firsts.repeat_interleave(sizes)  # in the same episode
-        seen = th.full_like(order, -1)
-        seen[order] = th.where(is_here, order[before.clamp(min=0)], -1)
-        by_age = seen[order[is_here]][ages[is_here].argsort(stable=True)]
-        sizes = th.bincount(ages[is_here], minlength=1)
-        is_met = sizes * len(sizes) >= MET * len(self)
+        starts = th.full_like(order, -1)
+        starts[order] = th.where(is_here, order[before.clamp(min=0)], -1)
+        by_age = starts[order[is_here]][ages[is_here].argsort(stable=True)]
         by_age = th.cat([by_age, by_age.new_zeros(1)])  # a place for what is looked up of an age without any
-        return seen, by_age, sizes.cumsum(0) - sizes, sizes, is_met
+        sizes = th.bincount(ages[is_here], minlength=1)
+        is_common = sizes * len(sizes) >= COMMON * len(self)
+        return Seen(starts, by_age, sizes.cumsum(0) - sizes, sizes, is_common)
 
     def gather(self, starts: th.Tensor, length: int) -> Windows:
         """Return the windows at given starts.

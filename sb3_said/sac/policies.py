@@ -33,7 +33,7 @@ NOT_FINITE = (
     "damaged, or its training diverged."
 )
 
-#: Arguments of the policy that an algorithm has to serve, as it learns
+#: Arguments of the policy that ask for something of whoever trains it; only ``StableSAC`` does it all
 SERVED = ("normalise_states", "scale_rewards", "average_actor")
 OWN_ARGUMENTS = ("augment_state", "delay_reconciled_critic", "critic_layer_norm", *SERVED)
 

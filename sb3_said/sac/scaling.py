@@ -33,8 +33,8 @@ def running_return(reward: np.ndarray, before: np.ndarray, begins: np.ndarray, g
 class ReturnScale(OnTheHost):
     """The size of discounted returns so far, which rewards are divided by (SimbaV2, https://arxiv.org/abs/2502.15280).
 
-    Of every step's running return G_t = gamma G_{t-1} + r_t it keeps mean and variance, and the largest one:
-    ``value`` = max(sd(G), max |G| / 5), and 1 before the first.
+    Of every step's running return G_t = gamma G_{t-1} + r_t, with G_{t-1} = 0 where an episode begins, it keeps mean
+    and variance, and the largest one: ``value`` = max(sd(G), max |G| / 5), and 1 before the first.
     """
 
     mean: th.Tensor

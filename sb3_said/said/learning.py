@@ -162,10 +162,15 @@ class PlannerLearner(OfflineAlgorithm):
                 training.log(
                     let_the_best_answer(self, n_episodes, progress_bar, should_stop, planners[1:], make_trial_env)
                 )
-        # The latter where the same Ctrl-C came again, amid the trial
+        # Asked amid the trial, the outcome is still "done"
         if outcome == "stopped" or (should_stop is not None and should_stop()):
             raise KeyboardInterrupt
         self._planner_trained_at = self.num_timesteps
+
+    @property
+    def planner_is_current(self) -> bool:
+        """Whether the planner has learned, and was tried, on all steps so far. After logs always False."""
+        return self.policy.planner_is_trained and self._planner_trained_at == self.num_timesteps
 
     def learn_offline(  # the planner has its own number of updates, logs and checkpoints
         self: SelfLearner,
@@ -231,7 +236,7 @@ class PlannerLearner(OfflineAlgorithm):
 
         def on_step(n_updates: int) -> bool:
             self.num_timesteps = n_updates
-            # The first: else an expert that learns nothing answers
+            # After the first, too: until then the expert answers, which learns nothing
             if n_updates in (first, total) or n_updates % HAND_OVER_INTERVAL == 0:
                 training.hand_over()
             return self._goes_on(watcher)

@@ -217,7 +217,7 @@ class SAIDPolicy(DelayedSACPolicy):
 
     @contextmanager
     def preferring_who_answers(self) -> Iterator[None]:
-        """Hold for a while, in what a file keeps, who answers inside :meth:`answering`."""
+        """Write who answers inside :meth:`answering` into the buffers that a file keeps, and take it back."""
         parts = [self.expert_preferred] if self.student is None else [self.expert_preferred, self.student.preferred]
         before = [part.clone() for part in parts]
         if self._answer == "both" and self.student is not None:

@@ -55,9 +55,9 @@ class Trial:
     """(n_episodes,) of each of ``planner_ways``, in their order; of "planner", in the place of the way that is its own
     or behind them; and of "expert". Undiscounted, in the task's own rewards. Fewer of ways that were given up"""
     ages: np.ndarray
-    """(n_episodes,) age of the observations of each, amid the episode, in control steps; of one that ends before an
-    action shows, the largest, whose player begins all episodes; 0 for all where it changes within episodes, which then
-    differ in it from player to player"""
+    """(n_episodes,) age of an episode's observations once it has settled, in control steps. The largest for one that
+    ends before an action shows: that age's player begins every episode. 0 for all where it changes within some episode:
+    then no age belongs to an episode"""
     n_steps: int
     """taken by all together, those of environments that wait for the others, too"""
 

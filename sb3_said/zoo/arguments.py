@@ -124,7 +124,7 @@ def ending_training(*errors: type[Exception]) -> Iterator[None]:
 
 
 #: What code in a setting may raise, beside ``ValueError`` and ``TypeError``.
-OF_CODE = (ArithmeticError, AttributeError, LookupError, NameError, RuntimeError, SyntaxError)
+CODE_ERRORS = (ArithmeticError, AttributeError, LookupError, NameError, RuntimeError, SyntaxError)
 
 
 @contextmanager
@@ -134,7 +134,7 @@ def reading_settings() -> Iterator[None]:
     """
     try:
         yield
-    except OF_CODE as error:
+    except CODE_ERRORS as error:
         raise ValueError(f"A setting cannot be read: {error!r}") from error
 
 

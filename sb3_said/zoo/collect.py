@@ -36,8 +36,8 @@ from sb3_said.delays.space import (
 from sb3_said.offline.datasets import Dataset
 from sb3_said.offline.scores import normalized_score, reference_returns
 from sb3_said.offline.writing import check_target, write_dataset
+from sb3_said.zoo.algorithms import ALGOS
 from sb3_said.zoo.arguments import add_delay, add_playing, check_positive, explained, make_parser, read_delay
-from sb3_said.zoo.manager import ALGOS
 from sb3_said.zoo.record import import_packages
 from sb3_said.zoo.runs import LoadedRun, answering, load_run, origin
 
@@ -247,8 +247,8 @@ def open_agent(name: str, args: argparse.Namespace) -> LoadedRun:
     """
     path = Path(name)
     if not (path.is_file() and zipfile.is_zipfile(path) and "policy.pth" in zipfile.ZipFile(path).namelist()):
-        played = args.algo, args.env, read_delay(args.delay), args.device
-        run = load_run(path, *played, gym_packages=args.gym_packages)
+        played = {"algo": args.algo, "env_id": args.env, "delay": read_delay(args.delay), "device": args.device}
+        run = load_run(path, gym_packages=args.gym_packages, **played)
         changes = {name: given for name, given in run.changes.items() if name != "action_delay"}  # no log shows it
         return replace(run, changes=changes)
     if args.env is None or args.algo not in ALGOS:

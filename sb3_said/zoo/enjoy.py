@@ -218,9 +218,9 @@ def main(argv: list[str] | None = None) -> None:
         drawn: dict[str, Any] = {"render_mode": "rgb_array" if video else "human"}
         if args.size is not None:
             drawn |= {"width": args.size, "height": args.size}
-        played = args.algo, args.env, read_delay(args.delay), args.device, drawn, args.gym_packages
+        played = {"algo": args.algo, "env_id": args.env, "delay": read_delay(args.delay), "device": args.device}
         with naming_libraries() if video else nullcontext():
-            run = load_run(args.run, *played, answer=args.answer)
+            run = load_run(args.run, env_kwargs=drawn, gym_packages=args.gym_packages, answer=args.answer, **played)
         if args.beside_ignorant and not longest_delay(run.model):
             raise ValueError(f"--beside-ignorant needs an agent that is told an age; {args.run} knows no delay.")
         with answering(run.model, args.answer), closing(video) if video else nullcontext():

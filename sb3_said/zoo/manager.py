@@ -16,7 +16,7 @@ from typing import Any
 
 import gymnasium as gym
 from filelock import FileLock
-from rl_zoo3 import ALGOS, exp_manager
+from rl_zoo3 import exp_manager
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -24,16 +24,17 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalC
 from stable_baselines3.common.logger import Logger, make_output_format
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecNormalize
 
-from sb3_said import SAID, DelayedSAC, PlannerTrainingCallback, StableSAC
+from sb3_said import SAID, DelayedSAC, PlannerTrainingCallback
 from sb3_said.delays.space import ages_of
 from sb3_said.files.archive import SavedFileError
 from sb3_said.files.arguments import with_given
 from sb3_said.files.atomic import write_json, write_text
 from sb3_said.files.checkpoint import CHECKPOINT_NAME, TrainingCheckpointCallback, restore_training
 from sb3_said.files.normalization import load_normalization, normalization_file, save_normalization
-from sb3_said.offline import BC, DQL, OfflineAlgorithm
+from sb3_said.offline import OfflineAlgorithm
 from sb3_said.offline.datasets import is_file
 from sb3_said.planner.config import SAMPLING_SETTINGS
+from sb3_said.zoo.algorithms import ALGORITHMS, NESTED
 from sb3_said.zoo.answer import (
     BEST_NAME,
     EXPERT_FOLDER,
@@ -57,26 +58,10 @@ from sb3_said.zoo.stopping import Stopping, shield
 
 LONGEST_NAME = 100  # of what a folder says of delays and logs; file systems end at 255
 
-OF_ALL_ENVIRONMENTS = "frame_stack", "vec_env_wrapper"  # of rl_zoo3; no command can play their agents
-#: What each name on the command line is: a class and the flags that make it so.
-ALGORITHMS: dict[str, tuple[type[DelayedSAC], dict[str, bool]]] = {
-    "said": (SAID, {}),
-    "sac": (DelayedSAC, {"augment_state": False, "delay_reconciled_critic": False}),
-    "sa": (DelayedSAC, {"augment_state": True, "delay_reconciled_critic": False}),
-    "dr": (DelayedSAC, {"augment_state": False, "delay_reconciled_critic": True}),
-    "sadr": (DelayedSAC, {"augment_state": True, "delay_reconciled_critic": True}),
-    "stable": (StableSAC, {}),
-    "bc": (BC, {}),
-    "dql": (DQL, {}),
-}
-for _name, (_class, _) in ALGORITHMS.items():
-    ALGOS[_name] = _class
+VEC_WRAPPERS = "frame_stack", "vec_env_wrapper"  # of rl_zoo3; no command can play their agents
+for _name in ALGORITHMS:
     HYPERPARAMS_SAMPLER[_name] = HYPERPARAMS_SAMPLER["sac"]
     HYPERPARAMS_CONVERTER[_name] = HYPERPARAMS_CONVERTER["sac"]
-
-
-#: Hyper-parameters that are settings by name, of which each can be given alone.
-NESTED = sorted({name for cls, _ in ALGORITHMS.values() for name in cls.settings_arguments})
 
 
 @dataclass(frozen=True)
@@ -141,8 +126,8 @@ class DelayedExperimentManager(ExperimentManager):
         self.run = run
         self.stopping = Stopping()
         self.evaluation: StoppableEvaluation | None = None
-        self._of_expert = True  # are the environments made now
-        self._has_told = False  # that there is no delay
+        self._under_expert_delay = True  # whether create_envs makes the expert's environments
+        self._has_told_of_no_delay = False
         self.lock: FileLock | None = None
         self._uuid = zoo_kwargs.get("uuid_str", "")
         self._given = given = self.custom_hyperparams or {}
@@ -209,7 +194,7 @@ class DelayedExperimentManager(ExperimentManager):
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
         """Preprocess them as rl_zoo3 does; evaluations are of the task as the YAML has it, too."""
-        if refused := [name for name in OF_ALL_ENVIRONMENTS if hyperparams.get(name)]:
+        if refused := [name for name in VEC_WRAPPERS if hyperparams.get(name)]:
             raise ValueError(
                 f"{', '.join(refused)} wraps all environments at once, and no command could play the agent: put "
                 "gymnasium.wrappers.FrameStackObservation and FlattenObservation into env_wrapper, or yours."
@@ -272,13 +257,13 @@ class DelayedExperimentManager(ExperimentManager):
         if self.run.expert_delay is not None:
             delays = self.run.expert_delay, self.run.delay
             self.env_wrapper = make_wrapper(
-                with_delay(self._own_wrappers, *(delays if self._of_expert else delays[::-1]))
+                with_delay(self._own_wrappers, *(delays if self._under_expert_delay else delays[::-1]))
             )
         if self.vec_env_class is SubprocVecEnv:
             shield()  # the training needs its environments to its end
         env = super().create_envs(*args, **kwargs)
-        if not self._has_told and "action_history" not in getattr(env.observation_space, "spaces", {}):
-            self._has_told = True  # a task may be registered with its delay, so its wrappers do not say
+        if not self._has_told_of_no_delay and "action_history" not in getattr(env.observation_space, "spaces", {}):
+            self._has_told_of_no_delay = True  # a task may be registered with its delay, so its wrappers do not say
             print(f"NO DELAY: this trains on {self.env_name.gym_id} without any delay; --delay 4 adds one of 4 steps.")
         return env
 
@@ -447,7 +432,7 @@ class DelayedExperimentManager(ExperimentManager):
         if is_answer and self.evaluation is not None and not self.stopping.is_asked:
             if self.run.expert_delay is not None:
                 self.evaluation.eval_env.close()
-                self._of_expert = False
+                self._under_expert_delay = False
                 self.evaluation.eval_env = self.create_envs(self.n_eval_envs, eval_env=True)
             evaluate_answer(model, self.evaluation, self.folder, self.stopping)
 
@@ -460,7 +445,7 @@ class DelayedExperimentManager(ExperimentManager):
         assert isinstance(model, DelayedSAC)
         model.task = self.env_name.gym_id  # which environments in other processes do not tell
         file = self.folder / f"{self.env_name}.zip"
-        is_unfinished = self.stopping.is_asked and isinstance(model, SAID) and not has_its_planner(model)
+        is_unfinished = self.stopping.is_asked and isinstance(model, SAID) and not model.planner_is_current
         if is_unfinished and _is_whole(file):  # of a run that had ended, and is trained for longer
             print(f"{file} stays as it was, with its planner.")
             return
@@ -525,17 +510,9 @@ def number_of(setting: Any) -> Any:
     return int(number) if number.is_integer() else number
 
 
-def has_its_planner(model: SAID) -> bool:
-    """Tell whether an agent's planner is trained to the end, and tried, on all that its expert has learned from.
-
-    One of logs is not told apart: its run is.
-    """
-    return bool(model.policy.planner_is_trained and model._planner_trained_at == model.num_timesteps)
-
-
 def _is_whole(file: Path) -> bool:
     """Tell whether a file has an agent, and that its planner."""
     try:
-        return file.is_file() and has_its_planner(SAID.load(file, device="cpu"))
+        return file.is_file() and SAID.load(file, device="cpu").planner_is_current
     except SavedFileError:
         return False

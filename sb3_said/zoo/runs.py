@@ -35,9 +35,9 @@ from sb3_said.files.agents import task_of
 from sb3_said.files.archive import SavedFileError, load_metadata
 from sb3_said.files.normalization import load_normalization, normalization_file
 from sb3_said.said.policies import Answer
+from sb3_said.zoo.algorithms import ALGORITHMS
 from sb3_said.zoo.arguments import Delay, largest_delay
 from sb3_said.zoo.folder import find_agent, find_normalization, resuming
-from sb3_said.zoo.manager import ALGORITHMS, has_its_planner
 from sb3_said.zoo.record import ENDED_NAME, WRAPPER, Record, entry_of, import_packages, is_delays, make_wrapper
 
 ANSWERS = get_args(Answer)
@@ -192,7 +192,7 @@ def load_run(
 
 def _warn_if_unfinished(model: BaseAlgorithm, file: Path, record: Record | None) -> None:
     is_last = record is not None and file.name == record.agent_name  # and no better one of amid the training
-    if not is_last or not isinstance(model, SAID) or has_its_planner(model) or (file.parent / ENDED_NAME).is_file():
+    if not is_last or not isinstance(model, SAID) or model.planner_is_current or (file.parent / ENDED_NAME).is_file():
         return
     has_some = model.policy.planner_is_trained
     what = "trained to the end, and tried: it plays as it is" if has_some else "trained: its expert plays"

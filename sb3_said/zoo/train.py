@@ -15,9 +15,19 @@ import rl_zoo3.train
 
 from sb3_said.offline import OfflineAlgorithm
 from sb3_said.offline.datasets import is_file
-from sb3_said.zoo.arguments import OF_CODE, Delay, add_delay, check_positive, device, explained, make_parser, read_delay
+from sb3_said.zoo.algorithms import ALGORITHMS, ALGOS
+from sb3_said.zoo.arguments import (
+    CODE_ERRORS,
+    Delay,
+    add_delay,
+    check_positive,
+    device,
+    explained,
+    make_parser,
+    read_delay,
+)
 from sb3_said.zoo.folder import TUNED_SETTINGS
-from sb3_said.zoo.manager import ALGORITHMS, ALGOS, DelayedExperimentManager, Run
+from sb3_said.zoo.manager import DelayedExperimentManager, Run
 from sb3_said.zoo.offline import OfflineExperimentManager
 from sb3_said.zoo.presets import PRESETS
 from sb3_said.zoo.record import ENDED_NAME, TO_IMPORT, Record
@@ -126,7 +136,7 @@ def main(argv: list[str] | None = None) -> None:
     sys.argv = [sys.argv[0], "--algo", algo, *zoo_argv]
     try:
         rl_zoo3.train.train()
-    except (AssertionError, ImportError, ValueError, *OF_CODE) as error:
+    except (AssertionError, ImportError, ValueError, *CODE_ERRORS) as error:
         if made:
             raise
         mend = f": {TO_IMPORT}" * isinstance(error, ImportError)

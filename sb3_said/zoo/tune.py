@@ -167,8 +167,8 @@ def tune(args: argparse.Namespace) -> None:
 
     planners.train(args.depths)
     left = args.timeout - (time.monotonic() - began)
-    how = (args.sampler, args.n_trials, args.episodes, args.round, args.seed, left)
-    search(study, tried, planners.put, play, *how)
+    how = {"sampler": args.sampler, "n_trials": args.n_trials, "round_size": args.round, "timeout": left}
+    search(study, tried, planners.put, play, episodes=args.episodes, seed=args.seed, **how)
     with FileLock(folder / "report.lock"):
         winner = find_winner(study)  # while nobody else reports one
         if winner is None:

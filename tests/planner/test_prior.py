@@ -118,7 +118,7 @@ def test_it_learns_from_steps_of_the_episode_and_of_the_age_s_window_alone(monke
     for d, guess, valid in fitted:
         assert th.equal(valid, windows.valid & (th.arange(LENGTH) < d + planner.config.horizon))
         own = planner.first_guess(z, windows.actions, th.full((30,), d), known, longest=d)
-        th.testing.assert_close(guess, planner._in_units(own))
+        th.testing.assert_close(guess, planner._normalized_guess(own))
 
 
 @th.no_grad()

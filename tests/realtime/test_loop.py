@@ -315,7 +315,7 @@ def test_it_expects_what_19_of_the_last_20_answers_took(n_slow, expected):
 def test_an_overrun_is_an_action_more_than_half_a_period_late():
     found = LoopStatistics()
     for gap in (0.5, 1.0, 1.49, 1.5, 1.51, 7.0):
-        found.count(gap=gap)
+        found.count_gap(gap)
     assert found.overruns == 2
 
 

@@ -21,7 +21,7 @@ from sb3_said.files.archive import load_tree
 from sb3_said.offline import BC, DQL, IQL, REFERENCE_RETURNS, DQLConfig, IQLConfig
 from sb3_said.offline.learning import GradientStepBar
 from sb3_said.zoo import evaluate, train, tune
-from sb3_said.zoo.manager import ALGOS
+from sb3_said.zoo.algorithms import ALGOS
 from sb3_said.zoo.offline import OfflineExperimentManager
 from sb3_said.zoo.presets import PRESETS, config_file, dataset_kind, preset_overrides
 from sb3_said.zoo.record import Record
