@@ -10,11 +10,10 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from torch.nn import functional as F
-from tqdm.auto import tqdm
 
 from sb3_said.planner import InpaintingPlanner
 from sb3_said.planner.inpainting import newest
-from sb3_said.planner.plain import OneStepModel, ZScored
+from sb3_said.planner.plain import OneStepModel, ZScored, descend
 from sb3_said.planner.yardstick import RegressionYardstick
 from sb3_said.replay.windows import Windows, WindowSource, mean_and_deviation
 
@@ -149,15 +148,12 @@ def train_belief(
     """
     device, generator = belief.mean.device, th.Generator().manual_seed(seed)
     belief.fit_scale(source)
-    optimizer = th.optim.Adam(belief.parameters(), belief.learning_rate)
-    scheduler = th.optim.lr_scheduler.CosineAnnealingLR(optimizer, gradient_steps)
-    for _ in tqdm(range(gradient_steps), desc=type(belief).__name__, disable=not progress_bar):
-        windows = source.sample(batch_size, max(belief.max_delay, 1) + 1, generator).to(device)  # a model takes a step
-        loss = belief.loss(windows, generator)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        scheduler.step()
+    length = max(belief.max_delay, 1) + 1  # a model takes a step
+
+    def loss() -> th.Tensor:
+        return belief.loss(source.sample(batch_size, length, generator).to(device), generator)
+
+    descend(loss, {belief: belief.learning_rate}, None, gradient_steps, type(belief).__name__, progress_bar, None)
 
 
 @th.no_grad()

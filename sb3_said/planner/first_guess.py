@@ -6,11 +6,10 @@ from collections.abc import Callable
 
 import torch as th
 from torch import nn
-from tqdm.auto import tqdm
 
 from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.normalizer import Normalizer
-from sb3_said.planner.plain import OneStepModel, plain_network
+from sb3_said.planner.plain import OneStepModel, descend, plain_network
 from sb3_said.planner.values import window_weight
 from sb3_said.replay.windows import Windows, WindowSource
 
@@ -141,34 +140,9 @@ def fit_first_guess(
 
     rate, asked = OneStepModel.learning_rate, (progress_bar, should_stop)
     rates = {model: rate, clone: CLONE_LEARNING_RATE}
-    if not _descend(both_losses, rates, None, n_updates, "first guess", *asked):
+    if not descend(both_losses, rates, None, n_updates, "first guess", *asked):
         return False
     if longest == 1:
         return True
     rates, n_updates = {model: ROLLED_RATE * rate}, -(-n_updates // ROLLED_EACH)
-    return _descend(lambda: model_loss(draw(longest + 1)), rates, ROLLED_CLIP, n_updates, f"{longest} steps", *asked)
-
-
-def _descend(
-    loss: Callable[[], th.Tensor],
-    rates: dict[nn.Module, float],
-    clip: float | None,
-    n_updates: int,
-    name: str,
-    progress_bar: bool,
-    should_stop: Callable[[], bool] | None,
-) -> bool:
-    """Make updates of Adam, whose rates fall to 0 by a cosine; return whether all were made."""
-    optimizer = th.optim.Adam([{"params": [*x.parameters()], "lr": rate} for x, rate in rates.items()], fused=True)
-    scheduler = th.optim.lr_scheduler.CosineAnnealingLR(optimizer, n_updates)
-    for _ in tqdm(range(n_updates), desc=name, disable=not progress_bar):
-        optimizer.zero_grad()
-        loss().backward()
-        if clip is not None:
-            for network in rates:
-                th.nn.utils.clip_grad_norm_(network.parameters(), clip)
-        optimizer.step()
-        scheduler.step()
-        if should_stop is not None and should_stop():
-            return False
-    return True
+    return descend(lambda: model_loss(draw(longest + 1)), rates, ROLLED_CLIP, n_updates, f"{longest} steps", *asked)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch as th
 from torch import nn
+from tqdm.auto import tqdm
 
 from sb3_said.replay.windows import mean_and_deviation
 
@@ -18,6 +21,38 @@ def plain_network(n_in: int, n_out: int, hidden: int) -> nn.Sequential:
     return nn.Sequential(
         *(nn.Linear(n_in, hidden), nn.ReLU()), *(nn.Linear(hidden, hidden), nn.ReLU()), nn.Linear(hidden, n_out)
     )
+
+
+def descend(
+    loss: Callable[[], th.Tensor],
+    rates: dict[nn.Module, float],
+    clip: float | None,
+    n_updates: int,
+    name: str,
+    progress_bar: bool,
+    should_stop: Callable[[], bool] | None,
+) -> bool:
+    """Make updates of Adam, whose rates fall to 0 by a cosine; return whether all were made.
+
+    :param loss: of a batch that it draws
+    :param rates: learning rate of each network
+    :param clip: largest norm of a network's gradient; None for any
+    :param name: for the progress bar
+    :param should_stop: asked after every update; None never stops
+    """
+    optimizer = th.optim.Adam([{"params": [*x.parameters()], "lr": rate} for x, rate in rates.items()], fused=True)
+    scheduler = th.optim.lr_scheduler.CosineAnnealingLR(optimizer, n_updates)
+    for _ in tqdm(range(n_updates), desc=name, disable=not progress_bar):
+        optimizer.zero_grad()
+        loss().backward()
+        if clip is not None:
+            for network in rates:
+                th.nn.utils.clip_grad_norm_(network.parameters(), clip)
+        optimizer.step()
+        scheduler.step()
+        if should_stop is not None and should_stop():
+            return False
+    return True
 
 
 class ZScored(nn.Module):

@@ -15,12 +15,12 @@ from stable_baselines3.common.utils import configure_logger
 
 from sb3_said.delays.space import ages_of
 from sb3_said.files.normalization import get_statistics, set_statistics
-from sb3_said.offline import IQL, ImplicitValues, OfflineAlgorithm, load_dataset
+from sb3_said.offline import IQL, ImplicitValues, load_dataset
 from sb3_said.planner import InpaintingPlanner
 from sb3_said.planner.checks import check_intervals, whole
 from sb3_said.planner.trainer import PlannerTrainer, seeded
 from sb3_said.planner.values import returns_to_go
-from sb3_said.said.policies import SAIDPolicy, Value
+from sb3_said.said.agent import PlannerAgent
 from sb3_said.said.training import PlannerTraining
 from sb3_said.said.trial import MakeEnv, let_the_best_answer, stopped_alone
 from sb3_said.said.ways import in_way, masks_of, untried, ways_of
@@ -31,18 +31,8 @@ HAND_OVER_INTERVAL = 100  # updates of an offline training
 SelfLearner = TypeVar("SelfLearner", bound="PlannerLearner")
 
 
-class PlannerLearner(OfflineAlgorithm):
-    """An agent with a planner, which it trains; :class:`~sb3_said.said.SAID` sets what is declared here."""
-
-    policy: SAIDPolicy
-    planner_gradient_steps: int
-    planner_train_freq: int | None
-    planner_newest_fraction: float
-    planner_terminal_penalty: float | None
-    planner_trial_episodes: int
-    planner_ways: dict[str, dict[str, Any]]
-    value: Value
-    _planner_trained_at: int  # num_timesteps of the last planner training
+class PlannerLearner(PlannerAgent):
+    """An agent that trains its planner."""
 
     def make_planner_trainer(
         self, gradient_steps: int | None = None, planner: InpaintingPlanner | None = None
@@ -167,11 +157,6 @@ class PlannerLearner(OfflineAlgorithm):
             raise KeyboardInterrupt
         self._planner_trained_at = self.num_timesteps
 
-    @property
-    def planner_is_current(self) -> bool:
-        """Whether the planner has learned, and was tried, on all steps so far. After logs always False."""
-        return self.policy.planner_is_trained and self._planner_trained_at == self.num_timesteps
-
     def learn_offline(  # the planner has its own number of updates, logs and checkpoints
         self: SelfLearner,
         dataset: Any,
@@ -251,20 +236,10 @@ class PlannerLearner(OfflineAlgorithm):
         watcher.on_training_end()
         return self
 
-    @property
-    def has_expert(self) -> bool:
-        """Whether actor and critics have learned, here or where ``set_parameters`` has them from."""
-        return self._n_updates > 0 or len(self.actor.optimizer.state) > 0
-
     def _check_decider(self, decided_by: str | None) -> None:
         """:raises ValueError: for the actor, where no expert has learned"""
         if decided_by == "actor" and not self.has_expert:
             raise ValueError("decided_by='actor' lets the expert's actor decide, which this agent has not trained.")
-
-    @property
-    def newest_fraction(self) -> float:
-        """The part of the replay that is imitated: all of a log, no step of which is newer than another."""
-        return 1.0 if self.replay_buffer.holds_logs else self.planner_newest_fraction
 
     @th.no_grad()
     def _stored_values(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:

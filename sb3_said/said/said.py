@@ -24,9 +24,9 @@ from sb3_said.planner.trainer import seeded
 from sb3_said.sac import StableSAC
 from sb3_said.sac.policies import settings_of
 from sb3_said.said.callbacks import PlannerTrainingCallback
+from sb3_said.said.distillation import Distillation, distill
 from sb3_said.said.learning import PlannerLearner
 from sb3_said.said.policies import Answer, SAIDPolicy, Value
-from sb3_said.said.student import Distillation, distill
 from sb3_said.said.ways import WAY_SETTINGS, check_scored, ways_of
 
 SelfSAID = TypeVar("SelfSAID", bound="SAID")
@@ -319,7 +319,7 @@ class SAID(PlannerLearner, StableSAC):
 
         :param width: of its two hidden layers; by default ``student_width``, or 256 where that is None
         :param progress_bar: show one
-        :param settings: fields of :class:`~sb3_said.said.student.Distillation`, such as ``n_labels`` or ``q_weight``
+        :param settings: of :class:`~sb3_said.said.distillation.Distillation`, such as ``n_labels`` or ``q_weight``
         :return: root mean square of its error over held-out answers of the planner, in actions in [-1, 1]
         :raises ValueError: without a trained planner, with neither a replay nor an environment, or where the scale of
             the replay's states is missing

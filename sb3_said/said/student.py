@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,49 +9,12 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
-from torch.nn import functional as F
-from tqdm.auto import tqdm
 
-from sb3_said.delays.space import KEYS, check_spaces
-from sb3_said.planner.checks import check_settings, whole
+from sb3_said.delays.space import check_spaces
+from sb3_said.planner.checks import whole
 from sb3_said.planner.plain import ZScored, plain_network
-from sb3_said.replay.windows import WindowSource
 from sb3_said.sac.extractors import StateAugmentedExtractor
 from sb3_said.sac.policies import as_array
-
-SAID = Any  # whose module imports this one
-HELD_OUT = 0.05  # of the replay's labels
-LABELLED_AT_ONCE = 512
-
-
-@dataclass(frozen=True)
-class Distillation:
-    """How a student learns. The values are ours; a quarter of these visits and a third of these updates kept 81 % of a
-    Hopper-v5 planner's return where these kept all of it (results/student.md).
-    """
-
-    n_labels: int = 50_000
-    """answers of the planner to observations from the replay, drawn as its windows are, at ages drawn from all that it
-    plans at"""
-    own_steps: int = 40_000
-    """and to those that the student visits itself (DAgger, Ross et al. 2011), over all rounds"""
-    rounds: int = 10
-    """of visiting and learning on, after the first learning"""
-    gradient_steps: int = 60_000
-    """updates, over all rounds"""
-    batch_size: int = 256
-    learning_rate: float = 1e-3
-    """of Adam; falls linearly to 0"""
-    q_weight: float = 0.0
-    """of -min Q(s_t, a) beside the squared error, in mean sizes of Q as in TD3+BC (Fujimoto and Gu 2021). For replay
-    alone, which knows the true state s_t"""
-
-    def __post_init__(self) -> None:
-        check_settings(
-            self, {"n_labels": 1, "own_steps": 0, "rounds": 0, "gradient_steps": 1, "batch_size": 1, "q_weight": 0}
-        )
-        if not self.learning_rate > 0:
-            raise ValueError(f"learning_rate is {self.learning_rate}, expected a number above 0.")
 
 
 class Student(ZScored):
@@ -106,111 +68,6 @@ class Student(ZScored):
         for layer in hidden:
             x = np.maximum(x @ as_array(layer.weight).T + as_array(layer.bias), 0.0)
         return np.tanh(x @ as_array(last.weight).T + as_array(last.bias))
-
-
-@dataclass
-class _Rows:
-    """What a student learns from."""
-
-    inputs: th.Tensor  # (M, n_inputs)
-    labels: th.Tensor  # (M, act_dim)
-    presents: th.Tensor  # (M, obs_dim), s_t; NaN where it is not known
-
-    @staticmethod
-    def join(parts: list[_Rows]) -> _Rows:
-        return _Rows(*map(th.cat, zip(*(vars(part).values() for part in parts), strict=True)))
-
-    def __getitem__(self, rows: th.Tensor | slice) -> _Rows:
-        return _Rows(*(part[rows] for part in vars(self).values()))
-
-
-def distill(model: SAID, config: Distillation, progress_bar: bool = False) -> float:
-    """Train the policy's student, and return its error: the root mean square over labels that it did not learn from.
-
-    :param model: with a trained planner, and a replay or an environment; without a replay, the planner's own visits
-        take its place
-    :param progress_bar: show one
-    """
-    model.policy.set_training_mode(False)
-    student, generator = model.policy.student, th.Generator().manual_seed(model.seed or 0)
-    if model.replay_buffer is not None and model.replay_buffer.size() > 0:
-        source = model.replay_buffer.window_source(model.newest_fraction, model.get_vec_normalize_env())
-        n_parts = -(-config.n_labels // LABELLED_AT_ONCE)
-        bar = tqdm(range(n_parts), desc="the planner's answers", disable=not progress_bar)
-        rows = _Rows.join([_replayed(model, source, generator) for _ in bar])[: config.n_labels]
-    else:
-        rows = _visited(model, "planner", config.n_labels, generator)
-    n_held_out = int(HELD_OUT * len(rows.inputs))
-    held_out, rows = rows[:n_held_out], rows[n_held_out:]
-    student.scale_to(rows.inputs)
-    optimizer = th.optim.Adam(student.network.parameters(), lr=config.learning_rate)
-    schedule = th.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, config.gradient_steps)
-    rounds = config.rounds if model.env is not None and config.own_steps > 0 else 0
-    visits = {*np.linspace(0, config.gradient_steps, rounds + 2, dtype=int)[1:-1].tolist()}
-    for k in tqdm(range(config.gradient_steps), desc="student", disable=not progress_bar):
-        if k in visits:
-            rows = _Rows.join([rows, _visited(model, "student", -(-config.own_steps // rounds), generator)])
-        drawn = th.randint(len(rows.inputs), (config.batch_size,), generator=generator).to(rows.inputs.device)
-        loss = _loss(model, rows[drawn], config.q_weight)
-        optimizer.zero_grad()
-        loss.backward(inputs=[*student.network.parameters()])  # Q's own have no use for it
-        optimizer.step()
-        schedule.step()
-    with th.no_grad():
-        left = held_out if n_held_out else rows
-        return float(F.mse_loss(student.answer(left.inputs), left.labels).sqrt())
-
-
-def _loss(model: SAID, batch: _Rows, q_weight: float) -> th.Tensor:
-    answers = model.policy.student.answer(batch.inputs)
-    loss = F.mse_loss(answers, batch.labels)
-    is_known = ~batch.presents.isnan().any(1)
-    if q_weight > 0 and is_known.any():
-        values = model.policy.values  # learned offline, where there are no critics
-        q_value = model.policy.q_value if values is None else values.q_value
-        q = q_value(batch.presents[is_known], answers[is_known])
-        loss = loss - q_weight * q.mean() / q.abs().mean().detach().clamp(min=1e-6)
-    return loss
-
-
-@th.no_grad()
-def _labelled(model: SAID, parts: dict[str, th.Tensor], presents: th.Tensor) -> _Rows:
-    """Ask the planner at temperature 0 about delayed observations, or the actor on its guess where that decides."""
-    batches = zip(*(parts[key].split(LABELLED_AT_ONCE) for key in KEYS), strict=True)
-    labels = [model.policy.answer_without_noise(dict(zip(KEYS, batch, strict=True))) for batch in batches]
-    is_delayed = isinstance(model.observation_space, spaces.Dict)
-    inputs = model.policy.student.read(parts if is_delayed else parts["observation"])
-    return _Rows(inputs, th.cat(labels), presents)
-
-
-def _replayed(model: SAID, source: WindowSource, generator: th.Generator) -> _Rows:
-    """Label observations of the replay, seen at ages that the planner plans at."""
-    planner, n, max_delay = model.policy.planner, LABELLED_AT_ONCE, model.policy.max_delay
-    windows = source.sample(n, max_delay + 1, generator, planner.config.early_probability)
-    ages = th.full((n,), max_delay)
-    if planner.config.mask != "fixed":
-        ages = th.randint(max_delay + 1, (n,), generator=generator)
-    ages = th.minimum(ages, windows.valid.sum(1) - 1)  # (B,): s_t is in the window
-    steps = th.arange(max_delay) - (max_delay - ages)[:, None]  # (B, D): index of each action in the window
-    history = windows.actions.gather(1, steps.clamp(min=0)[..., None].expand(-1, -1, planner.act_dim))
-    history = th.where(steps[..., None] >= 0, history, 0.0)
-    presents = windows.states[th.arange(n), ages]
-    parts = {"observation": windows.states[:, 0], "action_history": history, "delay": ages[:, None].float()}
-    device = model.device
-    return _labelled(model, {key: part.to(device) for key, part in parts.items()}, presents.to(device))
-
-
-def _visited(model: SAID, who: str, n_steps: int, generator: th.Generator) -> _Rows:
-    """Play the training environment, and label where that leads."""
-    visited: list[dict[str, th.Tensor]] = []
-    with model.borrowed_env() as env, model.policy.answering(who, at_once=True):
-        env.seed(int(th.randint(2**31, (), generator=generator)))
-        obs: Any = env.reset()
-        for _ in range(-(-n_steps // env.num_envs)):
-            visited.append(as_delayed(model.policy.obs_to_tensor(obs)[0], model.policy.planner.act_dim))
-            obs = env.step(model.predict(obs, deterministic=True)[0])[0]
-    parts = {key: th.cat([each[key] for each in visited]) for key in KEYS}
-    return _labelled(model, parts, th.full_like(parts["observation"], th.nan))
 
 
 def as_delayed(observation: PyTorchObs, act_dim: int) -> dict[str, th.Tensor]:

@@ -17,11 +17,10 @@ from sb3_said.offline.iql import IQL
 from sb3_said.planner.checks import check_same
 from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.trainer import PlannerTrainer, worse_than_regression
+from sb3_said.said.agent import PlannerAgent
 
 PLANNER_CHECKPOINT_NAME = "planner_checkpoint.zip"
 SECOND_CHECKPOINT_NAME = "planner_{mask}_checkpoint.zip"  # of one of another mask than the default's
-
-SAID = Any  # whose module imports this one
 
 
 def planner_checkpoint(folder: Path, mask: str) -> Path:
@@ -44,7 +43,7 @@ class PlannerTraining:
 
     def __init__(
         self,
-        model: SAID,
+        model: PlannerAgent,
         trainer: PlannerTrainer,
         value_trainer: IQL | None,
         row: Callable[[int], int],
@@ -135,13 +134,15 @@ class PlannerTraining:
         if self.has_handed_over and self.is_agents:
             self.model.policy.planner_updates.fill_(float(self.trainer.n_updates))
             self.model.policy.set_answer("planner")
-            if self.value_trainer is not None:
-                self.model.policy.values.load_state_dict(self.value_trainer.values.state_dict())
+            if self.value_trainer is not None and (values := self.model.policy.values) is not None:
+                values.load_state_dict(self.value_trainer.values.state_dict())
 
     def log(self, values: Mapping[str, float | str]) -> None:
         """Write a row to the agent's logger, which keeps what it holds for its next one."""
         logger = self.model.logger
-        pending = [(x, x.copy()) for x in (logger.name_to_value, logger.name_to_count, logger.name_to_excluded)]
+        pending: list[tuple[Any, Any]] = [
+            (x, x.copy()) for x in (logger.name_to_value, logger.name_to_count, logger.name_to_excluded)
+        ]
         for entries, _ in pending:
             entries.clear()
         for key, value in values.items():

@@ -15,9 +15,9 @@ from tqdm.auto import tqdm
 
 from sb3_said.files.normalization import get_statistics, set_statistics
 from sb3_said.planner import InpaintingPlanner
+from sb3_said.said.agent import PlannerAgent
 from sb3_said.said.ways import players_of
 
-SAID = Any  # whose module imports this one
 MakeEnv = Callable[[int], VecEnv]  # of a number of environments
 
 CUT_AT = 10  # times the longest stored episode: a good answer may never end one
@@ -63,7 +63,7 @@ class Trial:
 
 
 def play_trial(
-    model: SAID,
+    model: PlannerAgent,
     n_episodes: int,
     progress_bar: bool = False,
     should_stop: Callable[[], bool] | None = None,
@@ -127,9 +127,10 @@ def play_trial(
 
 
 @contextmanager
-def _env_of(model: SAID, n_episodes: int, make_env: MakeEnv | None) -> Iterator[VecEnv]:
+def _env_of(model: PlannerAgent, n_episodes: int, make_env: MakeEnv | None) -> Iterator[VecEnv]:
     """Hand out what a trial is played in: the training environment, or those that are made, and closed behind it."""
     n_envs = min(AT_ONCE, n_episodes)
+    assert model.env is not None  # a trial is of an agent that has one
     made = None if make_env is None or model.env.num_envs >= n_envs else _made(model, make_env, n_envs)
     if made is None:
         with model.borrowed_env() as env:
@@ -141,12 +142,12 @@ def _env_of(model: SAID, n_episodes: int, make_env: MakeEnv | None) -> Iterator[
         _close(made)
 
 
-def _made(model: SAID, make_env: MakeEnv, n_envs: int) -> VecEnv | None:
+def _made(model: PlannerAgent, make_env: MakeEnv, n_envs: int) -> VecEnv | None:
     """Make environments that show what the training's do; where that fails, warn, and return none."""
     own, env = model.get_vec_normalize_env(), None
     try:
         env = make_env(n_envs)
-        if env.unwrapped is model.env.unwrapped:
+        if model.env is not None and env.unwrapped is model.env.unwrapped:
             return None  # which is not to be closed
         normalizer = unwrap_vec_normalize(env)
         if own is not None and normalizer is None:
@@ -188,7 +189,7 @@ def _settled_age(ages: np.ndarray, max_delay: int) -> float:
 
 
 def _play(
-    model: SAID, env: VecEnv, n_episodes: int, seed: int, bar: tqdm, should_stop: Callable[[], bool] | None
+    model: PlannerAgent, env: VecEnv, n_episodes: int, seed: int, bar: tqdm, should_stop: Callable[[], bool] | None
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Return the returns and ages of the episodes from the resets seed, seed + 1, ..., and the steps taken.
 
@@ -271,7 +272,7 @@ def best_answer(trial: Trial) -> tuple[str, float, bool]:
 
 
 def let_the_best_answer(
-    model: SAID,
+    model: PlannerAgent,
     n_episodes: int,
     progress_bar: bool = False,
     should_stop: Callable[[], bool] | None = None,
@@ -291,9 +292,9 @@ def let_the_best_answer(
     way, cut, is_below = best_answer(trial)
     model.policy.take_planner(*players.get(way, own))
     if 0 <= cut < model.policy.max_delay:
-        model.set_answer("both", **({"expert_up_to": int(cut)} if is_below else {"expert_from": int(cut) + 1}))
+        model.policy.set_answer("both", **({"expert_up_to": int(cut)} if is_below else {"expert_from": int(cut) + 1}))
     else:
-        model.set_answer("planner" if cut < 0 else "expert")
+        model.policy.set_answer("planner" if cut < 0 else "expert")
     if np.isinf(cut):
         warnings.warn(
             f"The planner is worse than its expert: mean returns of {trial.returns[way].mean():.5g} and "

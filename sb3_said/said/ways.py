@@ -9,8 +9,7 @@ from typing import Any
 from sb3_said.planner import InpaintingPlanner
 from sb3_said.planner.config import SAMPLING_SETTINGS, PlannerConfig
 from sb3_said.sac.policies import settings_of
-
-SAID = Any  # whose module imports this one
+from sb3_said.said.agent import PlannerAgent
 
 NAME_LENGTH = 25  # of a way; SB3's log takes longer ones that begin alike for the same
 
@@ -103,12 +102,12 @@ def untried(config: PlannerConfig, ways: Collection[dict[str, Any]]) -> PlannerC
     return replace(config, **{name: getattr(PlannerConfig, name) for name in named}, mask=mask)
 
 
-def _configs(model: SAID) -> dict[str, PlannerConfig]:
+def _configs(model: PlannerAgent) -> dict[str, PlannerConfig]:
     """Return the planner's settings in each of the agent's ways to decide."""
     return {name: in_way(model.policy.planner.config, settings) for name, settings in model.planner_ways.items()}
 
 
-def masks_of(model: SAID) -> list[str]:
+def masks_of(model: PlannerAgent) -> list[str]:
     """Return the masks that the agent's ways to decide need a planner of, its planner's own first.
 
     Where not every age of 0..D was trained on, or none is known, as of logs, there are no decisions of each age to
@@ -125,7 +124,7 @@ def masks_of(model: SAID) -> list[str]:
 
 
 def players_of(
-    model: SAID, planners: Sequence[InpaintingPlanner]
+    model: PlannerAgent, planners: Sequence[InpaintingPlanner]
 ) -> dict[str, tuple[InpaintingPlanner, PlannerConfig]]:
     """Return who decides in each of the agent's ways that one of these planners, or its own, can play, and how.
 

@@ -262,3 +262,12 @@ def test_a_delay_beyond_those_tried_is_warned_of():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert estimate_delay(*late).delay == 11
+
+
+def test_resamples_are_as_many_as_asked_for_and_of_the_seed():
+    rng = np.random.default_rng(1)
+    log = [linear_states(rng.normal(size=(400, 2)))], [rng.normal(size=(400, 2))]  # actions of no effect
+    found = [estimate_delay(*log, max_delay=4, seed=seed).confidence for seed in (1, 1, 2, 3)]
+    assert found[0] == found[1] and len(set(found)) > 1
+    part = 7 * estimate_delay(*log, max_delay=4, n_resamples=7).confidence
+    assert part == pytest.approx(round(part), abs=1e-9)

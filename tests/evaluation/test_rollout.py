@@ -353,3 +353,37 @@ def test_latency_counts_the_first_call_of_a_model_that_warms_up() -> None:
     observations = collect_observations(lambda: AsDict(Countdown()), 7, seed=0)
     latency = measure_latency(model, observations, n_calls=20)
     assert latency.n_calls == 20 and model.batches == [1] * 20
+
+
+def test_a_latency_is_of_normalised_observations_of_one_episode():
+    asked = []
+
+    class Noting(Model):
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            asked.append((float(observation[0, 0]), state is None, episode_start.tolist()))
+            return super().predict(observation, state, episode_start)
+
+    measure_latency(Noting(), np.ones((3, 2)), n_calls=3, normalize=lambda observation: 5.0 * observation)
+    assert asked == [(5.0, True, [True])] + [(5.0, False, [False])] * 3
+
+
+def test_observations_repeat_with_their_seed():
+    first, again, other = (collect_observations("Pendulum-v1", 20, seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first[0], other[0])
+
+
+def test_how_rough_actions_without_bounds_are():
+    class Boundless(Waves):
+        def __init__(self) -> None:
+            super().__init__(falls=False)
+            self.action_space = gym.spaces.Box(-np.inf, np.inf, (2,))
+
+    class Alternates:
+        t = 0
+
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            self.t += 1
+            return np.array([[self.t % 2, 4.0]]), None
+
+    np.testing.assert_allclose(rollout(Alternates(), Boundless, 1, SEED).action_changes, 1 / 2)  # in their own units

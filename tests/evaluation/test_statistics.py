@@ -219,3 +219,21 @@ def test_an_interval_of_many_episodes_takes_no_gigabytes() -> None:
         largest = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert largest < 100e6 and found.low < found.value < found.high  # at once: 560 MB, and 96 MB a seed
+
+
+def test_percentiles_are_those_they_are_called():
+    latency = Latency.from_seconds(np.arange(101) / 1000)
+    assert (latency.p50_ms, latency.p95_ms, latency.p99_ms, latency.max_ms) == pytest.approx((50, 95, 99, 100))
+
+
+@pytest.mark.parametrize("interval", [confidence_interval, stratified_interval])
+def test_resamples_are_of_the_seed(interval: Any) -> None:
+    values = np.random.default_rng(0).normal(size=(12, 3))
+    first, again, other = (interval(values, n_resamples=200, seed=seed) for seed in (1, 1, 2))
+    assert first == again and first.low != other.low
+
+
+def test_a_stratified_interval_is_wider_where_it_is_to_cover_more():
+    values = np.random.default_rng(0).normal(size=(12, 3))
+    narrow, wide = (stratified_interval(values, confidence, n_resamples=2000) for confidence in (0.5, 0.99))
+    assert wide.low < narrow.low < narrow.high < wide.high

@@ -358,3 +358,15 @@ def test_data_of_another_task_is_refused():
 
 class Wide(Drift):
     observation_space = spaces.Box(-1.0, 1.0, (3,), np.float32)
+
+
+def test_a_part_of_the_ages_of_logs_is_exchanged_as_asked():
+    model = make(delayed(delay=(0, 2)), relabelled_ages=0.3)
+    model.take_dataset(demonstrations(2))
+    assert model.replay_buffer.relabelled_ages == 0.3
+
+
+def test_logs_tell_no_ages_of_their_decisions():
+    model = make(delayed(delay=(0, 2)))
+    model.take_dataset(demonstrations(2))
+    assert model.replay_buffer.window_source().ages is None

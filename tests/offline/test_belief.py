@@ -23,6 +23,7 @@ from sb3_said.offline.belief import (
     train_belief,
 )
 from sb3_said.planner.plain import FARTHEST
+from sb3_said.replay.windows import WindowSource
 
 DELAY = 3
 
@@ -244,3 +245,24 @@ def test_what_does_not_fit_is_refused():
         BeliefOnly(Truth(), type("Scaled", (Sees,), {"reads_normalized": True})())
     with pytest.raises(ValueError, match=r"serves delays up to 3, but the action history has 2 rows"):
         BeliefOnly(Truth(), Sees()).predict(delayed(2).reset(seed=0)[0])
+
+
+def test_a_belief_draws_by_its_seed_and_its_rate_falls_to_0(monkeypatch):
+    seeds, rates, sample, made = [], [], WindowSource.sample, th.optim.Adam
+
+    class Watched(made):
+        def step(self, closure=None):
+            rates.append(self.param_groups[0]["lr"])
+            return super().step(closure)
+
+    def noted(self, batch_size, length, generator=None, early_probability=0.0):
+        seeds.append(generator.initial_seed())
+        return sample(self, batch_size, length, generator, early_probability)
+
+    replay = make_bc()
+    replay.take_dataset(demonstrations(4))
+    monkeypatch.setattr(th.optim, "Adam", Watched)
+    monkeypatch.setattr(WindowSource, "sample", noted)
+    train_belief(RolledOutModel(2, 1, 3), replay.replay_buffer.window_source(), 10, seed=7)
+    assert seeds == [7] * 10
+    np.testing.assert_allclose(rates, RolledOutModel.learning_rate * (0.5 + 0.5 * np.cos(np.pi * np.arange(10) / 10)))

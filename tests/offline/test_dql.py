@@ -314,3 +314,11 @@ def test_a_naive_loss_is_the_imitation_loss():
         guess = actor.noise_of(obs[i : i + 1], noised[None], step[i : i + 1])
         action[i] = F.mse_loss(guess[0], noise[i]).item()
     assert loss.item() == pytest.approx(action.mean().item(), rel=1e-5)
+
+
+def test_the_clean_action_is_clipped_in_every_step(monkeypatch):
+    """As the authors' code does: else a guess far outside leads the later steps to where no data is."""
+    actor, seen = make().actor, []
+    monkeypatch.setattr(actor, "noise_of", lambda features, action, step: seen.append(action) or 0 * action - 50.0)
+    assert th.equal(actor.sample(th.zeros(20, 2)), th.ones(20, 1))
+    assert max(action.abs().max() for action in seen) < 10

@@ -16,7 +16,8 @@ def test_paper_config_is_the_papers_table():
     expected |= {"action_transform": "tanh", "scored_states": "all", "batch_size": 256, "learning_rate": 2e-4}
     expected |= {"ema_decay": 0.9999, "weight_factor": 2.0, "warmup_steps": 0, "gradient_clip": None}
     expected |= {"value_scale": "centred", "precision": "float32", "end_time_probability": 0.0}
-    expected |= {"early_probability": 0.0, "first_guess": "none"}
+    expected |= {"early_probability": 0.0, "first_guess": "none", "relative_states": False, "decision_weight": 1.0}
+    expected |= {"time_sampling": "uniform", "embed_known": False}
     assert expected.items() <= dataclasses.asdict(config).items()
     assert PlannerConfig.paper(sampling_steps=2).sampling_steps == 2
 
@@ -82,6 +83,13 @@ def test_config_survives_json():
         ({"gradient_clip": 0.0}, "give gradient_clip=None"),
         ({"extra_state_probability": 1.1}, r"extra_state_probability is 1.1, expected at most 1"),
         ({"ema_decay": 1.5}, r"ema_decay is 1.5, expected at most 1"),
+        ({"end_time_probability": 1.1}, "end_time_probability is 1.1, expected at most 1"),
+        ({"early_probability": 1.1}, "early_probability is 1.1, expected at most 1"),
+        ({"mask_end_probability": 1.1}, "mask_end_probability is 1.1, expected at most 1"),
+        ({"weight_decay": -1.0}, "weight_decay is -1.0, expected at least 0"),
+        ({"weight_factor": -1.0}, "weight_factor is -1.0, expected at least 0"),
+        ({"decision_weight": -1.0}, "decision_weight is -1.0, expected at least 0"),
+        ({"warmup_steps": -1}, "warmup_steps is -1, expected at least 0"),
     ],
 )
 def test_config_refuses(changes, message):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch as th
 from hypothesis import given, settings
@@ -14,10 +15,11 @@ from linear_system import ACTION_DIM, BEHAVIOUR_GAIN, STATE_DIM, make_source, ne
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner import first_guess as first_guess_module
 from sb3_said.planner import trainer as trainer_module
-from sb3_said.planner.first_guess import ROLLED_EACH, FirstGuess, fit_first_guess
+from sb3_said.planner.first_guess import CLONE_LEARNING_RATE, ROLLED_EACH, ROLLED_RATE, FirstGuess, fit_first_guess
 from sb3_said.planner.normalizer import Normalizer
-from sb3_said.planner.plain import FARTHEST
+from sb3_said.planner.plain import FARTHEST, OneStepModel
 from sb3_said.planner.trainer import PlannerTrainer
+from sb3_said.replay.windows import WindowSource
 
 D, HORIZON = 4, 3
 L = D + HORIZON
@@ -340,3 +342,52 @@ def test_without_a_guess_no_present_can_be_guessed():
     for changes in ({"first_guess": "none"}, {"mask": "fixed"}):
         with pytest.raises(ValueError, match="expected a first_guess"):
             PlannerConfig(present="guessed", **changes)
+
+
+def fitted(source):
+    normalizer = Normalizer(STATE_DIM, ACTION_DIM, L, "standard", relative_states=True)
+    normalizer.fit(source.start_states(), source.start_actions())
+    return normalizer
+
+
+def test_a_part_of_its_windows_begins_early_in_episodes(monkeypatch):
+    asked, sample, source = [], WindowSource.sample, make_source(10, 8)
+
+    def noted(self, batch_size, length, generator=None, early_probability=0.0):
+        asked.append((self is source, early_probability))
+        return sample(self, batch_size, length, generator, early_probability)
+
+    monkeypatch.setattr(WindowSource, "sample", noted)
+    config, older = PlannerConfig(early_probability=0.4), make_source(10, 8, seed=1)
+    fit_first_guess(make_guess(), source, fitted(source), config, 2, th.Generator(), D, older=older)
+    assert set(asked) == {(True, 0.4), (False, 0.4)}  # of the newest and of the older steps
+
+
+def test_its_rates_fall_to_0_and_many_steps_at_once_have_small_and_clipped_ones(monkeypatch):
+    rates, norms, made = [], [], th.optim.Adam
+
+    class Watched(made):
+        def step(self, closure=None):
+            rates.append([group["lr"] for group in self.param_groups])
+            gradients = [p.grad.norm() for group in self.param_groups for p in group["params"]]
+            norms.append(th.stack(gradients).norm().item())
+            return super().step(closure)
+
+    monkeypatch.setattr(th.optim, "Adam", Watched)
+    monkeypatch.setattr(first_guess_module, "ROLLED_CLIP", 1e-3)
+    source = make_source(10, 8)
+    fit_first_guess(make_guess(), source, fitted(source), PlannerConfig(), 32, th.Generator(), D)
+    assert [len(each) for each in rates] == [2] * 32 + [1] * 2  # of model and clone, then of the model alone
+    single, rolled = np.array(rates[:32]), np.array(rates[32:])[:, 0]
+    falls = 0.5 + 0.5 * np.cos(np.pi * np.arange(32) / 32)
+    np.testing.assert_allclose(single, np.outer(falls, [OneStepModel.learning_rate, CLONE_LEARNING_RATE]))
+    np.testing.assert_allclose(rolled, ROLLED_RATE * OneStepModel.learning_rate * np.array([1.0, 0.5]))
+    assert min(norms[:32]) > 1e-3 and max(norms[32:]) < 1.001e-3
+
+
+def test_older_steps_are_handed_to_its_model(monkeypatch):
+    older, given = make_source(5, 9, seed=1), []
+    monkeypatch.setattr(trainer_module, "fit_first_guess", lambda *args, older, **kwargs: given.append(older) or True)
+    planner = make_trainer().planner
+    PlannerTrainer(planner, make_source(40, 20), 2, older=older).make_first_guess()
+    assert th.equal(given[0].states, older.states)

@@ -662,3 +662,17 @@ def test_training_with_extra_states_resumes_bit_for_bit():
     assert_same(second.state_dict(), whole.state_dict())
     with pytest.raises(ValueError, match=r"extra_state_probability was 0\.5 and is now 0\.0"):
         make_trainer().load_state_dict(first.state_dict())
+
+
+def test_each_seed_holds_out_episodes_of_its_own():
+    source = make_source(40, 20)
+    for seed in (1, 2):
+        trainer, (training, _) = make_trainer(seed=seed, source=source), source.split(0.1, seed)
+        assert th.equal(trainer.source.envs, training.envs) and th.equal(trainer.source.rows, training.rows)
+
+
+def test_each_seed_begins_with_weights_of_its_own():
+    trainers = [make_trainer(seed=seed) for seed in (0, 0, 1)]
+    for name in ("average", "yardstick"):
+        own, same, another = (th.nn.utils.parameters_to_vector(getattr(t, name).parameters()) for t in trainers)
+        assert th.equal(own, same) and not th.equal(own, another)

@@ -215,3 +215,15 @@ def test_what_is_promised_is_sent(answers, hold_steps):
 def send_copy(ledger, n):
     """Return what the next n steps would send."""
     return [float(step.action[0]) for step in ledger._coming(max(n, 0))]
+
+
+def test_who_is_asked_may_change_what_it_was_given():
+    ledger = make()
+    ledger.observe([1.0], 0, None)
+    ledger.splice(plan(0.2), 0)
+    send(ledger)
+    request = ledger.request(0)
+    request.observation[:] = request.history[:] = 9.0
+    again = ledger.request(0)
+    assert again.observation == 1.0
+    np.testing.assert_array_equal(again.history[:, 0], np.float32([0, 0, 0, 0.1]))

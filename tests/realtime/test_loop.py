@@ -537,3 +537,12 @@ def test_a_looped_model_plays_one_environment():
     loop = in_steps(Recorder(TASK, 4))
     with pytest.raises(ValueError, match="one environment, got 2"):
         LoopedModel(loop).predict({"observation": np.zeros((2, 2)), "delay": np.zeros((2, 1))})
+
+
+def test_who_sends_an_action_may_change_it():
+    loop = in_steps(Recorder(TASK, 1))
+    loop.observe(ZEROS, n_executed=0)
+    sent = [loop.act(t) for t in range(2)]  # of ages 0 and 1; then it is held
+    kept = sent[1].copy()
+    sent[1][:] = 9.0
+    np.testing.assert_array_equal(loop.act(2), kept)

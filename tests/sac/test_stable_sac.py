@@ -547,3 +547,28 @@ def test_a_load_with_other_networks_names_what_the_file_has(tmp_path, name, save
         StableSAC.load(tmp_path / "stable.zip", **{name: asked})
     assert "[]" not in str(found.value)
     assert StableSAC.load(tmp_path / "stable.zip", batch_size=17).batch_size == 17
+
+
+def test_states_are_looked_at_also_where_the_replay_is_shorter_than_the_training():
+    model = make(delayed(3), buffer_size=60).learn(150)
+    assert model.policy.state_normalizer.fitted_at > 150 / 1.1 - 1
+
+
+def test_states_are_looked_at_when_there_are_a_tenth_more():
+    model = make(delayed(3)).learn(100)
+    normalizer = model.policy.state_normalizer
+    normalizer.fitted_at.fill_(100.0)
+    normalizer.mean.fill_(7.0)
+    for n_steps, is_due in ((109, False), (111, True)):
+        model.num_timesteps = n_steps
+        model._look_at_states()
+        assert bool((normalizer.mean != 7.0).any()) == is_due
+
+
+def test_a_full_replay_is_scaled_from_its_oldest_step_on(tmp_path):
+    """Steps 30 to 119, of episodes that begin at 0, 50 and 100: the longest is whole."""
+    teacher = make(delayed(3, length=50), buffer_size=90, learning_starts=1000).learn(120)
+    teacher.save_replay_buffer(tmp_path / "replay")
+    model = make(delayed(3, length=50), buffer_size=90)
+    model.load_replay_buffer(tmp_path / "replay")
+    assert model.policy.return_scale.largest == pytest.approx(sum(0.99**k for k in range(50)))

@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_said import SAID, PlannerConfig, StableSAC
 from sb3_said.files.archive import SavedFileError
-from sb3_said.offline import IQL, Dataset, IQLConfig
+from sb3_said.offline import IQL, Dataset, IQLConfig, load_dataset
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.said.policies import SAIDPolicy
 from sb3_said.said.training import PlannerTraining
@@ -455,3 +455,18 @@ def test_logs_are_learned_from_at_every_age():
     model = make(delayed(delay=(0, 2))).learn_offline(log(), 3)
     obs = observe(env=delayed(delay=1, max_delay=2))
     assert np.isfinite(answer(model, obs)).all()
+
+
+def test_v_reads_what_follows_an_episode_as_vec_normalize_leaves_it():
+    env = VecNormalize(DummyVecEnv([delayed]), norm_obs_keys=["observation"], norm_reward=False)
+    model = make(env, value="iql", learning_starts=100, planner_gradient_steps=1).learn(60)
+    data = load_dataset(model.replay_buffer, model.observation_space, model.action_space)
+    expected = env.normalize_obs({"observation": data.next_states})["observation"]
+    np.testing.assert_allclose(model._make_value_trainer().data.next_states, expected, atol=1e-5)
+
+
+def test_v_begins_with_weights_of_the_agents_seed():
+    kwargs = {"value": "iql", "learning_starts": 100, "planner_gradient_steps": 1}
+    agents = [make(seed=seed, **kwargs).learn(30) for seed in (0, 0, 4)]
+    first, again, other = (agent._make_value_trainer().values.v[0].weight for agent in agents)
+    assert th.equal(first, again) and not th.equal(first, other)

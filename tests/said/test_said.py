@@ -17,7 +17,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.torch_layers import FlattenExtractor
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_said import SAID, PlannerConfig, StableSAC
 from sb3_said.delays import TotalDelay, UniformDelay
@@ -374,7 +374,14 @@ def test_only_an_untrained_planner_may_be_of_other_settings(trained, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "other", [{"relative_states": False}, {"prediction": "epsilon"}, {"mask": "none"}, {"action_transform": "tanh"}]
+    "other",
+    [
+        {"relative_states": False},
+        {"prediction": "epsilon"},
+        {"mask": "none"},
+        {"action_transform": "tanh"},
+        {"schedule": "linear"},
+    ],
 )
 def test_a_trained_planner_is_not_taken_over_where_its_weights_mean_something_else(other, trained, saved, tmp_path):
     (name,) = other
@@ -566,3 +573,9 @@ def test_windows_weigh_what_rewards_and_critics_add_up_to():
     expected = expected[source.rows]
     np.testing.assert_allclose(source.values, (expected - expected.min()) / np.ptp(expected), atol=1e-5)
     assert trainer.generator.initial_seed() == 3
+
+
+def test_of_several_environments_the_older_steps_teach_the_guess_too():
+    kwargs = {"planner_newest_fraction": 0.6, "learning_starts": 100, "planner_gradient_steps": 1}
+    trainer = make(DummyVecEnv([delayed] * 2), **kwargs).learn(60).make_planner_trainer(1)
+    assert trainer._settings["n_windows"] == 36 and len(trainer.older) == 24

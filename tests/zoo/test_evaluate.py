@@ -358,17 +358,17 @@ def test_video_plays_in_real_time(fps: int, own: int | None, suffix: str, tmp_pa
             return np.random.default_rng(video._steps).integers(0, 255, (32, 32, 3), np.uint8)
 
     video = enjoy.Video(tmp_path / "sub" / f"film{suffix}", fps)
-    for _ in range(4 * (own or fps)):  # 4 seconds
+    for _ in range(2 * (own or fps)):  # 2 seconds
         video.on_step(Drawn())
     video.close()
-    assert len(imageio.imread(video.path)) == video.frames <= 4 * min(fps, own or fps)
+    assert len(imageio.imread(video.path)) == video.frames <= 2 * min(fps, own or fps)
     assert video.fps == pytest.approx(min(fps, own or fps), rel=0.25 if suffix == ".gif" else 0)  # in hundredths
     if own is None:  # nobody knows how long a step is
-        assert video.frames == 4 * fps
+        assert video.frames == 2 * fps
         return
     found = imageio.immeta(video.path)
     seconds = video.frames * found["duration"] / 1000 if suffix == ".gif" else found["duration"]
-    assert seconds == pytest.approx(4, abs=1.01 / video.fps)
+    assert seconds == pytest.approx(2, abs=1.01 / video.fps)
 
 
 def test_a_task_that_draws_nothing_is_told(tmp_path: Path) -> None:
