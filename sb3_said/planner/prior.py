@@ -6,6 +6,9 @@ import torch as th
 from torch import nn
 
 LEAST_STD = 0.01  # of a guess that is never wrong; in the planner's units
+# Of an entry that moves with its guess. One that a guess hardly moves, as contact forces that are mostly 0, would have
+# any: 85,000 was met, where no entry of the tasks without such forces has above 8 (results/settings.md)
+LARGEST_SLOPE = 10.0
 FEWEST_WINDOWS = 10  # that tell how far a guess is right; of one it looks as if it were never wrong
 
 
@@ -38,7 +41,7 @@ class Prior(nn.Module):
 
     @th.no_grad()
     def fit(self, delay: int, guess: th.Tensor, clean: th.Tensor, valid: th.Tensor) -> None:
-        """Learn by least squares how far guesses of one delay are right.
+        """Learn by least squares, within ``LARGEST_SLOPE``, how far guesses of one delay are right.
 
         :param guess: (M, L, n_entries), as of the next two in the planner's units
         :param clean: (M, L, n_entries), what they turned out to be
@@ -47,6 +50,7 @@ class Prior(nn.Module):
         """
         share = valid[..., None] / valid.sum(0).clamp(min=1)[:, None]  # (M, L, 1)
         slope = (share * guess * clean).sum(0) / (share * guess**2).sum(0).clamp(min=1e-12)
+        slope = slope.clamp(-LARGEST_SLOPE, LARGEST_SLOPE)
         std = (share * (clean - slope * guess) ** 2).sum(0).sqrt().clamp(min=LEAST_STD)
         is_seen = (valid.sum(0) >= FEWEST_WINDOWS)[:, None]
         self.slope[delay] = th.where(is_seen, slope, self.slope[delay])

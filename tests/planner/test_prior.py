@@ -10,7 +10,7 @@ from small_planner import ACT, DELAY, LENGTH, OBS, FakeNetwork, make_planner, ma
 
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner.diffusion import gaussian_prediction
-from sb3_said.planner.prior import FEWEST_WINDOWS, LEAST_STD, Prior
+from sb3_said.planner.prior import FEWEST_WINDOWS, LARGEST_SLOPE, LEAST_STD, Prior
 from sb3_said.planner.trainer import PlannerTrainer
 
 D, HORIZON = 4, 3
@@ -47,6 +47,20 @@ def test_a_step_that_few_windows_have_is_not_taken_for_a_sure_one():
     prior.fit(0, guess, clean, valid)
     assert prior.std[0, 0, 0] == pytest.approx(1, abs=0.1) and 0.4 < prior.std[0, 1, 0] < 1.6
     assert prior.std[0, 2:].tolist() == [[1.0]] * 2 and prior.slope[0, 2:].tolist() == [[0.0]] * 2
+
+
+def test_a_guess_that_hardly_moves_is_not_blown_up():
+    """As of Ant-v5's contact forces, which are 0 but for a few steps."""
+    generator = th.Generator().manual_seed(0)
+    guess, clean = 1e-4 * th.randn(500, 2, 1, generator=generator), th.zeros(500, 2, 1)
+    at = guess[:, :, 0].argmax(0)
+    clean[at, th.arange(2)] = 30.0  # one contact, of which the guess knows nothing
+    prior, valid = Prior(0, 2, 1), th.ones(500, 2, dtype=th.bool)
+    prior.fit(0, guess, clean, valid)
+    assert prior.slope[0].abs().max() <= LARGEST_SLOPE
+    mean, std = prior(th.ones(1, 2, 1), th.zeros(1, dtype=th.int64))
+    assert mean.abs().max() <= LARGEST_SLOPE
+    th.testing.assert_close(std[0], (clean - prior.slope[0] * guess).square().mean(0).sqrt())  # of that slope
 
 
 def test_a_guess_that_is_never_wrong_keeps_a_deviation():
