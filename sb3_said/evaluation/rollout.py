@@ -110,7 +110,7 @@ def rollout(
                 changes[episode] += np.mean(np.abs(action - before.get(episode, action)) / half_range)
                 before[episode] = action
                 if not (terminated or truncated):
-                    warn_if_long(lengths[episode], f"Episode {episode}")
+                    warn_if_long(lengths[episode], episode)
                 if on_step is not None:
                     on_step(e)
                 if terminated or truncated:
@@ -138,15 +138,16 @@ def rollout(
     return Rollout(returns, lengths, ended, changes, None if None in successes else np.array(successes, bool))
 
 
-def warn_if_long(steps: int, episode: str = "An episode") -> None:
+def warn_if_long(steps: int, episode: int | None = None) -> None:
     """Warn once of an episode that may have no end, as the task's author may not know.
 
     :param steps: that it has lasted so far
-    :param episode: what to call it
+    :param episode: its number, where it has one
     """
     if steps == LONG:
+        which = "An episode" if episode is None else f"Episode {episode}"
         warnings.warn(
-            f"{episode} has not ended after {LONG:,} steps, and is waited for. If it need never end, register the "
+            f"{which} has not ended after {LONG:,} steps, and is waited for. If it need never end, register the "
             "task with max_episode_steps, or train it with --env-kwargs max_episode_steps:1000.",
             stacklevel=3,
         )

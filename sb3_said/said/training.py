@@ -134,7 +134,9 @@ class PlannerTraining:
         if self.has_handed_over and self.is_agents:
             self.model.policy.planner_updates.fill_(float(self.trainer.n_updates))
             self.model.policy.set_answer("planner")
-            if self.value_trainer is not None and (values := self.model.policy.values) is not None:
+            if self.value_trainer is not None:
+                values = self.model.policy.values
+                assert values is not None  # which it trains
                 values.load_state_dict(self.value_trainer.values.state_dict())
 
     def log(self, values: Mapping[str, float | str]) -> None:

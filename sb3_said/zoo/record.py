@@ -251,7 +251,7 @@ def with_delay(own: Any, delay: Delay, other: Delay = None) -> list[Any]:
     listed = list(own) if isinstance(own, list) else [own] if own else []
     if delay is None:
         return listed
-    if any(is_delays(entry_of(wrapper)[0]) for wrapper in listed):
+    if any(is_delay_wrapper(entry_of(wrapper)[0]) for wrapper in listed):
         raise ValueError(f"The delay is given twice, as --delay {delay} and in env_wrapper={listed}; leave one out.")
     largest = {} if other is None else {"max_delay": max(largest_delay(delay), largest_delay(other))}
     return [*listed, {WRAPPER: {"delay": delay, **largest}}]
@@ -262,7 +262,7 @@ def entry_of(wrapper: Any) -> tuple[Any, dict[str, Any]]:
     return next(iter(wrapper.items())) if isinstance(wrapper, dict) else (wrapper, {})
 
 
-def is_delays(name: Any) -> bool:
+def is_delay_wrapper(name: Any) -> bool:
     """Tell whether a wrapper's name, or class, is the delay's."""
     return "DelayedObservationWrapper" in str(name)
 

@@ -38,7 +38,7 @@ from sb3_said.said.policies import Answer
 from sb3_said.zoo.algorithms import ALGORITHMS
 from sb3_said.zoo.arguments import Delay, largest_delay
 from sb3_said.zoo.folder import find_agent, find_normalization, resuming
-from sb3_said.zoo.record import ENDED_NAME, WRAPPER, Record, entry_of, import_packages, is_delays, make_wrapper
+from sb3_said.zoo.record import ENDED_NAME, WRAPPER, Record, entry_of, import_packages, is_delay_wrapper, make_wrapper
 
 ANSWERS = get_args(Answer)
 DELAYS = {"delay", "max_delay", "state_history"}  # of the wrapper: what an agent plays under, and what it reads of it
@@ -211,7 +211,7 @@ def changes(env_kwargs: dict[str, Any], wrappers: list[Any]) -> dict[str, Any]:
     """
     changed: dict[str, Any] = {"env_kwargs": env_kwargs} if env_kwargs else {}
     for name, given in map(entry_of, wrappers):
-        changed |= {x: given[x] for x in given.keys() - DELAYS} if is_delays(name) else {str(name): given}
+        changed |= {x: given[x] for x in given.keys() - DELAYS} if is_delay_wrapper(name) else {str(name): given}
     return changed
 
 
@@ -308,9 +308,9 @@ def _with_delay(wrappers: list[Any], delay: Delay, model: BaseAlgorithm) -> list
     if has_state_history(model.observation_space):
         kwargs["state_history"] = True
     given = [entry_of(wrapper) for wrapper in wrappers]
-    if not any(is_delays(name) for name, _ in given):
+    if not any(is_delay_wrapper(name) for name, _ in given):
         given.append((WRAPPER, {}))
-    return [{name: {**old, **kwargs} if is_delays(name) else old} for name, old in given]
+    return [{name: {**old, **kwargs} if is_delay_wrapper(name) else old} for name, old in given]
 
 
 def _check_spaces(model: BaseAlgorithm, env: gym.Env[Any, Any], file: Path) -> None:

@@ -11,6 +11,7 @@ from small_planner import make_batch, make_planner
 from small_task import Drift, delayed
 from test_bc import demonstrations
 from test_bc import make as make_bc
+from watching import watch_adam, watch_samples
 
 from sb3_said import DelayedObservationWrapper, DelayedSAC
 from sb3_said.evaluation import rollout
@@ -23,7 +24,6 @@ from sb3_said.offline.belief import (
     train_belief,
 )
 from sb3_said.planner.plain import FARTHEST
-from sb3_said.replay.windows import WindowSource
 
 DELAY = 3
 
@@ -248,21 +248,10 @@ def test_what_does_not_fit_is_refused():
 
 
 def test_a_belief_draws_by_its_seed_and_its_rate_falls_to_0(monkeypatch):
-    seeds, rates, sample, made = [], [], WindowSource.sample, th.optim.Adam
-
-    class Watched(made):
-        def step(self, closure=None):
-            rates.append(self.param_groups[0]["lr"])
-            return super().step(closure)
-
-    def noted(self, batch_size, length, generator=None, early_probability=0.0):
-        seeds.append(generator.initial_seed())
-        return sample(self, batch_size, length, generator, early_probability)
-
     replay = make_bc()
     replay.take_dataset(demonstrations(4))
-    monkeypatch.setattr(th.optim, "Adam", Watched)
-    monkeypatch.setattr(WindowSource, "sample", noted)
+    drawn, steps = watch_samples(monkeypatch), watch_adam(monkeypatch)
     train_belief(RolledOutModel(2, 1, 3), replay.replay_buffer.window_source(), 10, seed=7)
-    assert seeds == [7] * 10
+    assert [generator.initial_seed() for _, generator, _ in drawn] == [7] * 10
+    rates = [rate for (rate,), _ in steps]
     np.testing.assert_allclose(rates, RolledOutModel.learning_rate * (0.5 + 0.5 * np.cos(np.pi * np.arange(10) / 10)))

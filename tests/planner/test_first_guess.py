@@ -11,6 +11,7 @@ import torch as th
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from linear_system import ACTION_DIM, BEHAVIOUR_GAIN, STATE_DIM, make_source, next_state, present
+from watching import watch_adam, watch_samples
 
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner import first_guess as first_guess_module
@@ -19,7 +20,6 @@ from sb3_said.planner.first_guess import CLONE_LEARNING_RATE, ROLLED_EACH, ROLLE
 from sb3_said.planner.normalizer import Normalizer
 from sb3_said.planner.plain import FARTHEST, OneStepModel
 from sb3_said.planner.trainer import PlannerTrainer
-from sb3_said.replay.windows import WindowSource
 
 D, HORIZON = 4, 3
 L = D + HORIZON
@@ -351,32 +351,19 @@ def fitted(source):
 
 
 def test_a_part_of_its_windows_begins_early_in_episodes(monkeypatch):
-    asked, sample, source = [], WindowSource.sample, make_source(10, 8)
-
-    def noted(self, batch_size, length, generator=None, early_probability=0.0):
-        asked.append((self is source, early_probability))
-        return sample(self, batch_size, length, generator, early_probability)
-
-    monkeypatch.setattr(WindowSource, "sample", noted)
+    drawn, source = watch_samples(monkeypatch), make_source(10, 8)
     config, older = PlannerConfig(early_probability=0.4), make_source(10, 8, seed=1)
     fit_first_guess(make_guess(), source, fitted(source), config, 2, th.Generator(), D, older=older)
-    assert set(asked) == {(True, 0.4), (False, 0.4)}  # of the newest and of the older steps
+    asked = {(one is source, early_probability) for one, _, early_probability in drawn}
+    assert asked == {(True, 0.4), (False, 0.4)}  # of the newest and of the older steps
 
 
 def test_its_rates_fall_to_0_and_many_steps_at_once_have_small_and_clipped_ones(monkeypatch):
-    rates, norms, made = [], [], th.optim.Adam
-
-    class Watched(made):
-        def step(self, closure=None):
-            rates.append([group["lr"] for group in self.param_groups])
-            gradients = [p.grad.norm() for group in self.param_groups for p in group["params"]]
-            norms.append(th.stack(gradients).norm().item())
-            return super().step(closure)
-
-    monkeypatch.setattr(th.optim, "Adam", Watched)
+    steps = watch_adam(monkeypatch)
     monkeypatch.setattr(first_guess_module, "ROLLED_CLIP", 1e-3)
     source = make_source(10, 8)
     fit_first_guess(make_guess(), source, fitted(source), PlannerConfig(), 32, th.Generator(), D)
+    rates, norms = zip(*steps, strict=True)
     assert [len(each) for each in rates] == [2] * 32 + [1] * 2  # of model and clone, then of the model alone
     single, rolled = np.array(rates[:32]), np.array(rates[32:])[:, 0]
     falls = 0.5 + 0.5 * np.cos(np.pi * np.arange(32) / 32)

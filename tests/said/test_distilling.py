@@ -9,8 +9,8 @@ from small_task import Drift, delayed
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch.nn import functional as F
+from watching import watch_adam, watch_samples
 
-from sb3_said.replay.windows import WindowSource
 from sb3_said.sac.extractors import StateAugmentedExtractor
 from sb3_said.said import distillation
 
@@ -34,19 +34,13 @@ def pupil(taught):
 
 
 def test_its_error_is_over_rows_that_it_did_not_learn_from_and_its_rate_falls_to_0(pupil, monkeypatch):
-    learned_from, rates, loss, made = [], [], distillation._loss, th.optim.Adam
-
-    class Watched(made):
-        def step(self, closure=None):
-            rates.append(self.param_groups[0]["lr"])
-            return super().step(closure)
+    learned_from, loss, steps = [], distillation._loss, watch_adam(monkeypatch)
 
     def recorded(model, batch, q_weight):
         learned_from.append(batch.inputs)
         return loss(model, batch, q_weight)
 
     monkeypatch.setattr(distillation, "_loss", recorded)
-    monkeypatch.setattr(th.optim, "Adam", Watched)
     pupil.planner_newest_fraction = 0.5  # of 60 steps
     try:
         error = pupil.distill(**{**QUICK, "own_steps": 0, "gradient_steps": 100}, learning_rate=0.01)
@@ -63,6 +57,7 @@ def test_its_error_is_over_rows_that_it_did_not_learn_from_and_its_rate_falls_to
         assert error == pytest.approx((student.answer(inputs[:35]) - labels[:35]).square().mean().sqrt().item())
     drawn = th.randint(665, (64,), generator=generator)  # of the first batch
     assert th.equal(learned_from[0], inputs[35:][drawn])
+    rates = [rate for (rate,), _ in steps]
     np.testing.assert_allclose(rates, 0.01 * (1 - np.arange(100) / 100), atol=1e-9)
 
 
@@ -197,14 +192,9 @@ def test_the_student_plays_as_often_as_asked_for(gradient_steps, rounds, pupil, 
 
 
 def test_labels_are_of_windows_that_begin_early_as_often_as_the_planners(taught, monkeypatch):
-    asked, sample = [], WindowSource.sample
-
-    def noted(self, batch_size, length, generator=None, early_probability=0.0):
-        asked.append(early_probability)
-        return sample(self, batch_size, length, generator, early_probability)
-
-    monkeypatch.setattr(WindowSource, "sample", noted)
+    drawn = watch_samples(monkeypatch)
     replayed(taught, th.Generator().manual_seed(0))
+    asked = [early_probability for _, _, early_probability in drawn]
     assert asked == [taught.policy.planner.config.early_probability] and asked[0] > 0
 
 
