@@ -1,5 +1,7 @@
 """Variance-preserving diffusion in continuous time: schedules, predictions, DDIM. Knows no network.
 
+"DV" is the public code of Lu et al. 2025, as in ``config``.
+
 A noisy sample at time t is ``x = alpha(t) * clean + sigma(t) * noise`` with ``alpha^2 + sigma^2 = 1``.
 """
 
@@ -26,7 +28,7 @@ def alpha_sigma(t: th.Tensor, schedule: str) -> tuple[th.Tensor, th.Tensor]:
     """Return the factors of the clean sample and of the noise, each of the shape of t.
 
     :param t: diffusion times in [0, ``END_TIMES[schedule]``]
-    :param schedule: ``"cosine"`` (Nichol and Dhariwal 2021) or ``"linear"`` (the paper's, as in DV)
+    :param schedule: ``"cosine"`` (Nichol and Dhariwal 2021) or ``"linear"`` (DV's)
     """
     if schedule == "cosine":
         return th.cos(math.pi / 2 * t), th.sin(math.pi / 2 * t)
@@ -78,7 +80,7 @@ def draw_times(
 ) -> th.Tensor:
     """Draw training times on the generator's device: (n,) float32 in [START_TIME, END_TIMES[schedule]].
 
-    :param time_sampling: ``"uniform"`` (the paper's) or ``"logit_normal"`` (Esser et al. 2024), more in the middle
+    :param time_sampling: ``"uniform"`` (DV's) or ``"logit_normal"`` (Esser et al. 2024), more in the middle
     :param end_probability: part of the times that are the last one, where every sampling starts
     """
     device = "cpu" if generator is None else generator.device
@@ -103,7 +105,7 @@ class SolverStep(NamedTuple):
 
 @cache
 def solver_steps(schedule: str, n_steps: int) -> tuple[SolverStep, ...]:
-    """Return the coefficients of DDIM's steps (Song et al. 2021, eta 0) at uniform times, as the paper's.
+    """Return the coefficients of DDIM's steps (Song et al. 2021, eta 0) at uniform times, as DV's.
 
     :param schedule: see :func:`alpha_sigma`
     :param n_steps: number of network evaluations

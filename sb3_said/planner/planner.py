@@ -218,7 +218,7 @@ class InpaintingPlanner(nn.Module):
         what a graph would not see change, nothing is recorded.
 
         With ``mask="fixed"`` every window has ``max_delay`` known actions. At an episode's start, s_0 stands for
-        s_{t-D} and zeros for the actions before it (paper, Appendix B).
+        s_{t-D} (paper, Appendix B.1) and zeros for the actions before it (section 4.4).
 
         :param observation: (B, obs_dim) delayed observations s_{t-d}
         :param action_history: (B, D, act_dim), the D newest actions, oldest first

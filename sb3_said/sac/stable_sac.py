@@ -39,8 +39,9 @@ class StableSAC(DelayedSAC):
       waits while the training episodes have lost half of what was learned (like TD7's checkpoints, sac/episodes.py).
 
     With ``scale_rewards=False, normalise_states=False, policy_delay=1, actor_averaging=0.0, ent_coef="auto",
-    target_entropy="auto"`` it is ``DelayedSAC``, but for the order of an update, where the critics come first, and for
-    ``target_update_interval``, of which SB3 counts the gradient steps within one rollout, and this all of them.
+    target_entropy="auto"`` it is ``DelayedSAC``, but for the order of an update, where the entropy coefficient
+    comes last, and for ``target_update_interval``, of which SB3 counts the gradient steps within one rollout, and this
+    all of them.
 
     :param policy: ``"MultiInputPolicy"`` or ``"MlpPolicy"``, which name the same class
     :param env: a task in a ``DelayedObservationWrapper``, or one with a 1-D Box observation (delay 0)

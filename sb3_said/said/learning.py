@@ -173,11 +173,11 @@ class PlannerLearner(PlannerAgent):
     ) -> SelfLearner:
         """Train the planner, and V(s) beside it, on logs of a task without delay (paper, Algorithm 2).
 
-        No environment is stepped and no expert is trained; the planner serves every delay 0..D. Callbacks are called
-        after each update, and meet a planner that is at most 100 updates old, after the last one as it is.
-        ``num_timesteps`` counts updates. From the first on the planner answers, by plans, and in the default way where
-        it decides in another of ``planner_ways``, as a trial chooses: none is played on logs. V(s) scores candidates
-        from then on (``value="iql"``), also where ``learn`` goes on.
+        No environment is stepped and no expert is trained; the planner serves every delay 0..D, with ``mask="fixed"`` D
+        alone. Callbacks are called after each update, and meet a planner that is at most 100 updates old, after the
+        last one as it is. ``num_timesteps`` counts updates. From the first on the planner answers, by plans, and in the
+        default way where it decides in another of ``planner_ways``, as a trial chooses: none is played on logs. V(s)
+        scores candidates from then on (``value="iql"``), also where ``learn`` goes on.
 
         :param dataset: whatever :func:`~sb3_said.offline.load_dataset` reads; None for what ``take_dataset`` took
         :param gradient_steps: ``planner_gradient_steps`` by default

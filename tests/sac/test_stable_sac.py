@@ -274,6 +274,8 @@ def test_one_update_is_that_of_the_formulas():
     for parameter, gradient in zip(actor.parameters(), expected, strict=True):
         th.testing.assert_close(parameter.grad, gradient)
     assert not any(map(th.equal, before, actor.parameters()))
+    gradient = -(log_prob.detach() + model.target_entropy).mean()
+    th.testing.assert_close(model.log_ent_coef.grad, gradient.reshape(1))
     assert model.log_ent_coef.exp().item() != pytest.approx(0.01, rel=1e-6)
 
 

@@ -296,10 +296,16 @@ def test_other_logs_are_not_gone_on_with(tmp_path):
         make().learn_offline(log(seed=1), 4, folder=tmp_path, save_interval=2)
 
 
-def test_v_is_learned_online_too_and_before_it_the_critics_bootstrap():
+def test_v_is_learned_online_too_and_returns_to_go_have_the_critics_values_at_cuts(monkeypatch):
     model = make(value="iql").learn(60)
     fresh = make(value="iql").policy.values.v[0].weight
     assert model.policy.values is not None and not th.equal(model.policy.values.v[0].weight, fresh)
+    asked = []
+    monkeypatch.setattr(model, "_stored_values", lambda states, _: asked.append(states) or th.zeros(len(states)))
+    model.make_planner_trainer()
+    source = model.replay_buffer.window_source(model.newest_fraction, None)
+    ends = source.start_states()[(source.remaining == 1) & ~source.terminated[source.rows, source.envs]]
+    assert len(ends) > 1 and th.equal(th.cat(asked), ends)
     with pytest.raises(ValueError, match="value is 'v', expected one of critics, iql"):
         make(value="v")
 

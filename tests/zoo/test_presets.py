@@ -105,7 +105,7 @@ def test_the_paper_preset_merged_is_the_papers_tables(env_id: str, delay: int, t
     # Table 3, in its order; a stride of 1, DDIM and the averaged weights are all that there is here
     expected: dict[str, Any] = {"planner_terminal_penalty": -100.0, "gamma": 0.99, "learning_rate": 3e-4}
     expected |= {"planner_gradient_steps": 1_000_000}
-    # Section 5.1 and Algorithm 1: 5 M steps, all of which the planner learns from, once; SADR as published
+    # Section 6.4 and Algorithm 1: 5 M steps, all of which the planner learns from, once; SADR as published
     expected |= {"n_timesteps": 5e6, "buffer_size": 5_000_000, "planner_newest_fraction": 1.0}
     expected |= {"planner_train_freq": None, "relabelled_ages": 0.0}
     expected |= {"scale_rewards": False, "normalise_states": False, "policy_delay": 1, "actor_averaging": 0.0}
