@@ -1,6 +1,6 @@
 """What a student keeps of its planner, and how fast it answers.
 
-    python benchmarks/distillation.py RUN --seeds 1 2 --q-weights 0 0.1 --delays 0 4 8 16 --json distillation.json
+    python benchmarks/distillation.py RUN --seeds 1 2 --delays 0 4 8 16 --json distillation.json
 
 RUN is the folder of a SAID run that has ended, with its checkpoint, which holds the replay, or any SAID agent with a
 log of the task in the replay's place (--log, such as scripts/collect.py makes). Each student learns from the planner at
@@ -53,7 +53,6 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     p.add_argument("run", type=Path, metavar="RUN")
     p.add_argument("--log", type=Path, help="dataset to learn from")
     p.add_argument("--seeds", type=int, nargs="+", default=[1], help="of the students")
-    p.add_argument("--q-weights", type=float, nargs="+", default=[0.0, 0.1], help="of -min Q(s, a) in the loss")
     p.add_argument("--settings", type=json.loads, default={}, metavar="JSON", help="other settings of distill()")
     p.add_argument("--delays", type=int, nargs="+", default=[0, 4, 8, 16])
     p.add_argument("--episodes", type=int, default=20, help="of each agent and delay")
@@ -76,14 +75,13 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
             rows["planner"] = play(model, args)
         write_json(args.json, document)
     for seed in args.seeds:
-        for q_weight in args.q_weights:
-            name = f"student, q_weight {q_weight:g}, seed {seed}"
-            if name not in rows:
-                model.seed = seed
-                error = model.distill(q_weight=q_weight, progress_bar=True, **args.settings)
-                with model.policy.answering("student"):
-                    rows[name] = play(model, args) | {"error": error}
-                write_json(args.json, document)
+        name = f"student, seed {seed}"
+        if name not in rows:
+            model.seed = seed
+            error = model.distill(progress_bar=True, **args.settings)
+            with model.policy.answering("student"):
+                rows[name] = play(model, args) | {"error": error}
+            write_json(args.json, document)
     show(rows)
     return rows
 

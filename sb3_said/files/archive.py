@@ -14,7 +14,7 @@ import os
 import sys
 import zipfile
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -76,17 +76,16 @@ def seal(archive: zipfile.ZipFile) -> bytes:
     return hashlib.sha256(members.encode()).hexdigest().encode()
 
 
-def load_tree(path: PathOrFile, kind: str | Sequence[str] | None = "tree") -> Any:
+def load_tree(path: PathOrFile, kind: str | None = "tree") -> Any:
     """Read what :func:`save_tree` wrote, running no code from the file.
 
     :param path: of the file, or a seekable binary file object
-    :param kind: as it was written, or several of which it may be one; None takes any
+    :param kind: as it was written; None takes any
     :raises SavedFileError: if it is no such file, is damaged, or comes from a newer version of this package
     """
     with readable(path), _opened(path) as (archive, document):
-        kinds = [kind] if isinstance(kind, str) else kind
-        if kinds is not None and document["kind"] not in kinds:
-            raise SavedFileError(f"it holds data of kind {document['kind']!r}, where {kinds[0]!r} was expected")
+        if kind not in (None, document["kind"]):
+            raise SavedFileError(f"it holds data of kind {document['kind']!r}, where {kind!r} was expected")
         arrays = (_read_array(archive, f"{index}.npy") for index in range(len(archive.namelist()) - 1))
         tree = _decode(document["tree"], arrays)
         if next(arrays, None) is not None:

@@ -256,7 +256,7 @@ def restore_evaluations(callback: BaseCallback | None, saved: list[dict[str, Any
         for name in _EVALUATION:
             setattr(eval_callback, name, kept[name])
         eval_callback.evaluations_successes = kept[_SUCCESSES]
-        for stopper, (best, n) in zip(_stoppers(eval_callback), kept.get(_PATIENCE, []), strict=False):
+        for stopper, (best, n) in zip(_stoppers(eval_callback), kept[_PATIENCE], strict=False):
             stopper.last_best_mean_reward, stopper.no_improvement_evals = best, n
 
 
@@ -348,7 +348,7 @@ def _check_evaluation(saved: dict[str, Any]) -> None:
         raise SavedFileError("evaluations differ in how many they are")
     if any(np.asarray(rows).dtype.kind not in "bif" for rows in (*results, successes) if rows):
         raise SavedFileError("evaluations hold more than numbers")
-    for mean, n in saved.get(_PATIENCE, []):  # of before 2026-11-30 without
+    for mean, n in saved[_PATIENCE]:
         if type(mean) is not float or mean != mean or type(n) is not int or n < 0:
             raise SavedFileError(f"an evaluation has not improved on {mean!s:.20} for {n!s:.20}")
 

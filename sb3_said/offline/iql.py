@@ -99,11 +99,6 @@ class ImplicitValues(ZScored):
         """
         return self.v(self._z(states))[..., 0] / self.scale
 
-    def q_value(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """Return the smaller of both Q(s, a): (...)."""
-        x = th.cat([self._z(states), actions], dim=-1)
-        return th.minimum(*(q(x)[..., 0] for q in self.q)) / self.scale
-
     def losses(self, batch: Transitions, gamma: float) -> dict[str, th.Tensor]:
         """Return the losses of V (equation 5) and Q (equation 6), in scaled rewards.
 

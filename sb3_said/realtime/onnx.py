@@ -34,13 +34,13 @@ class OnnxModel:
         try:
             self._session = onnxruntime.InferenceSession(os.fspath(path), options, providers=["CPUExecutionProvider"])
             properties = self._session.get_modelmeta().custom_metadata_map
-            dtype = np.dtype(properties.get("action_dtype", "float32"))  # files of before 2026-11-29 do not say
+            dtype = np.dtype(properties["action_dtype"])
             low, high = (np.array(json.loads(properties[name]), dtype) for name in ("action_low", "action_high"))
             self.action_space = spaces.Box(low, high, dtype=dtype.type)
         except Exception as error:  # onnxruntime has many kinds
             raise ValueError(f"{path} is no file of sb3-said export, or damaged ({error}): export it again.") from error
-        #: Whether it reads what VecNormalize has normalised; files of before 2026-11-26 do not say.
-        self.reads_normalized = properties.get("reads_normalized") == "true"
+        #: Whether it reads what VecNormalize has normalised.
+        self.reads_normalized = properties["reads_normalized"] == "true"
         state_space = spaces.Box(-np.inf, np.inf, (self._session.get_inputs()[0].shape[1],), np.float32)
         self.observation_space: spaces.Space[Any] = state_space
         if "delay" in [each.name for each in self._session.get_inputs()]:

@@ -414,7 +414,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
             ``buffer_size`` or ``n_envs``, or of logs that this algorithm does not learn from
         """
         found = existing(path, ".pkl")  # type: ignore[arg-type]  # io.BufferedIOBase is IO
-        state = load_tree(found, (REPLAY, "tree"))  # as which it was written until 2026-11-30
+        state = load_tree(found, REPLAY)
         replay = self.replay_buffer
         with readable(found, explained=(ValueError,)):
             if state["holds_logs"] is True:  # however long they are

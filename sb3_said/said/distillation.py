@@ -21,6 +21,8 @@ from sb3_said.said.student import Student, as_delayed
 HELD_OUT = 0.05  # of the replay's labels
 LABELLED_AT_ONCE = 512
 
+Labelled = tuple[th.Tensor, th.Tensor]  # what the student reads, (M, n_inputs), and the answers, (M, act_dim)
+
 
 @dataclass(frozen=True)
 class Distillation:
@@ -40,32 +42,11 @@ class Distillation:
     batch_size: int = 256
     learning_rate: float = 1e-3
     """of Adam; falls linearly to 0"""
-    q_weight: float = 0.0
-    """of -min Q(s_t, a) beside the squared error, in mean sizes of Q as in TD3+BC (Fujimoto and Gu 2021). For replay
-    alone, which knows the true state s_t"""
 
     def __post_init__(self) -> None:
-        check_settings(
-            self, {"n_labels": 1, "own_steps": 0, "rounds": 0, "gradient_steps": 1, "batch_size": 1, "q_weight": 0}
-        )
+        check_settings(self, {"n_labels": 1, "own_steps": 0, "rounds": 0, "gradient_steps": 1, "batch_size": 1})
         if not self.learning_rate > 0:
             raise ValueError(f"learning_rate is {self.learning_rate}, expected a number above 0.")
-
-
-@dataclass
-class _Rows:
-    """What a student learns from."""
-
-    inputs: th.Tensor  # (M, n_inputs)
-    labels: th.Tensor  # (M, act_dim)
-    presents: th.Tensor  # (M, obs_dim), s_t; NaN where it is not known
-
-    @staticmethod
-    def join(parts: list[_Rows]) -> _Rows:
-        return _Rows(*map(th.cat, zip(*(vars(part).values() for part in parts), strict=True)))
-
-    def __getitem__(self, rows: th.Tensor | slice) -> _Rows:
-        return _Rows(*(part[rows] for part in vars(self).values()))
 
 
 def distill(model: PlannerAgent, config: Distillation, progress_bar: bool = False) -> float:
@@ -81,28 +62,36 @@ def distill(model: PlannerAgent, config: Distillation, progress_bar: bool = Fals
         source = model.replay_buffer.window_source(model.newest_fraction, model.get_vec_normalize_env())
         n_parts = -(-config.n_labels // LABELLED_AT_ONCE)
         bar = tqdm(range(n_parts), desc="the planner's answers", disable=not progress_bar)
-        rows = _Rows.join([_replayed(model, source, generator) for _ in bar])[: config.n_labels]
+        read, labels = _joined([_replayed(model, source, generator) for _ in bar])
+        read, labels = read[: config.n_labels], labels[: config.n_labels]
     else:
-        rows = _visited(model, "planner", config.n_labels, generator)
-    n_held_out = int(HELD_OUT * len(rows.inputs))
-    held_out, rows = rows[:n_held_out], rows[n_held_out:]
-    student.scale_to(rows.inputs)
+        read, labels = _visited(model, "planner", config.n_labels, generator)
+    n_held_out = int(HELD_OUT * len(read))
+    held_out = read[:n_held_out], labels[:n_held_out]
+    read, labels = read[n_held_out:], labels[n_held_out:]
+    student.scale_to(read)
     optimizer = th.optim.Adam(student.network.parameters(), lr=config.learning_rate)
     schedule = th.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, config.gradient_steps)
     rounds = config.rounds if model.env is not None and config.own_steps > 0 else 0
     visits = {*np.linspace(0, config.gradient_steps, rounds + 2, dtype=int)[1:-1].tolist()}
     for k in tqdm(range(config.gradient_steps), desc="student", disable=not progress_bar):
         if k in visits:
-            rows = _Rows.join([rows, _visited(model, "student", -(-config.own_steps // rounds), generator)])
-        drawn = th.randint(len(rows.inputs), (config.batch_size,), generator=generator).to(rows.inputs.device)
-        loss = _loss(model, rows[drawn], config.q_weight)
+            visited = _visited(model, "student", -(-config.own_steps // rounds), generator)
+            read, labels = _joined([(read, labels), visited])
+        drawn = th.randint(len(read), (config.batch_size,), generator=generator).to(read.device)
+        loss = F.mse_loss(student.answer(read[drawn]), labels[drawn])
         optimizer.zero_grad()
-        loss.backward(inputs=[*student.network.parameters()])  # Q's own have no use for it
+        loss.backward()
         optimizer.step()
         schedule.step()
     with th.no_grad():
-        left = held_out if n_held_out else rows
-        return float(F.mse_loss(student.answer(left.inputs), left.labels).sqrt())
+        read, labels = held_out if n_held_out else (read, labels)
+        return float(F.mse_loss(student.answer(read), labels).sqrt())
+
+
+def _joined(parts: list[Labelled]) -> Labelled:
+    read, labels = map(th.cat, zip(*parts, strict=True))
+    return read, labels
 
 
 def _student_of(model: PlannerAgent) -> Student:
@@ -111,29 +100,17 @@ def _student_of(model: PlannerAgent) -> Student:
     return student
 
 
-def _loss(model: PlannerAgent, batch: _Rows, q_weight: float) -> th.Tensor:
-    answers = _student_of(model).answer(batch.inputs)
-    loss = F.mse_loss(answers, batch.labels)
-    is_known = ~batch.presents.isnan().any(1)
-    if q_weight > 0 and is_known.any():
-        values = model.policy.values  # learned offline, where there are no critics
-        q_value = model.policy.q_value if values is None else values.q_value
-        q = q_value(batch.presents[is_known], answers[is_known])
-        loss = loss - q_weight * q.mean() / q.abs().mean().detach().clamp(min=1e-6)
-    return loss
-
-
 @th.no_grad()
-def _labelled(model: PlannerAgent, parts: dict[str, th.Tensor], presents: th.Tensor) -> _Rows:
+def _labelled(model: PlannerAgent, parts: dict[str, th.Tensor]) -> Labelled:
     """Ask the planner at temperature 0 about delayed observations, or the actor on its guess where that decides."""
     batches = zip(*(parts[key].split(LABELLED_AT_ONCE) for key in KEYS), strict=True)
     labels = [model.policy.answer_without_noise(dict(zip(KEYS, batch, strict=True))) for batch in batches]
     is_delayed = isinstance(model.observation_space, spaces.Dict)
     inputs = _student_of(model).read(parts if is_delayed else parts["observation"])
-    return _Rows(inputs, th.cat(labels), presents)
+    return inputs, th.cat(labels)
 
 
-def _replayed(model: PlannerAgent, source: WindowSource, generator: th.Generator) -> _Rows:
+def _replayed(model: PlannerAgent, source: WindowSource, generator: th.Generator) -> Labelled:
     """Label observations of the replay, seen at ages that the planner plans at."""
     planner, n, max_delay = model.policy.planner, LABELLED_AT_ONCE, model.policy.max_delay
     windows = source.sample(n, max_delay + 1, generator, planner.config.early_probability)
@@ -144,13 +121,11 @@ def _replayed(model: PlannerAgent, source: WindowSource, generator: th.Generator
     steps = th.arange(max_delay) - (max_delay - ages)[:, None]  # (B, D): index of each action in the window
     history = windows.actions.gather(1, steps.clamp(min=0)[..., None].expand(-1, -1, planner.act_dim))
     history = th.where(steps[..., None] >= 0, history, 0.0)
-    presents = windows.states[th.arange(n), ages]
     parts = {"observation": windows.states[:, 0], "action_history": history, "delay": ages[:, None].float()}
-    device = model.device
-    return _labelled(model, {key: part.to(device) for key, part in parts.items()}, presents.to(device))
+    return _labelled(model, {key: part.to(model.device) for key, part in parts.items()})
 
 
-def _visited(model: PlannerAgent, who: Answer, n_steps: int, generator: th.Generator) -> _Rows:
+def _visited(model: PlannerAgent, who: Answer, n_steps: int, generator: th.Generator) -> Labelled:
     """Play the training environment, and label where that leads."""
     visited: list[dict[str, th.Tensor]] = []
     with model.borrowed_env() as env, model.policy.answering(who, at_once=True):
@@ -159,5 +134,4 @@ def _visited(model: PlannerAgent, who: Answer, n_steps: int, generator: th.Gener
         for _ in range(-(-n_steps // env.num_envs)):
             visited.append(as_delayed(model.policy.obs_to_tensor(obs)[0], model.policy.planner.act_dim))
             obs = env.step(model.predict(obs, deterministic=True)[0])[0]
-    parts = {key: th.cat([each[key] for each in visited]) for key in KEYS}
-    return _labelled(model, parts, th.full_like(parts["observation"], th.nan))
+    return _labelled(model, {key: th.cat([each[key] for each in visited]) for key in KEYS})

@@ -319,7 +319,7 @@ class SAID(PlannerLearner, StableSAC):
 
         :param width: of its two hidden layers; by default ``student_width``, or 256 where that is None
         :param progress_bar: show one
-        :param settings: of :class:`~sb3_said.said.distillation.Distillation`, such as ``n_labels`` or ``q_weight``
+        :param settings: of :class:`~sb3_said.said.distillation.Distillation`, such as ``n_labels``
         :return: root mean square of its error over held-out answers of the planner, in actions in [-1, 1]
         :raises ValueError: without a trained planner, with neither a replay nor an environment, or where the scale of
             the replay's states is missing

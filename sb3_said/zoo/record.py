@@ -121,11 +121,8 @@ class Record:
         """
         path = folder / RECORD_NAME
         if not path.is_file():
-            agents = ", ".join(str(file) for file in folder.glob("*-v*.zip"))
-            older = f" The agent of an older run opens alone: give {agents} with --algo and --env." if agents else ""
             raise ValueError(
                 f"{folder} holds no run: {path} is missing. Give the folder that the training printed as 'Log path'."
-                f"{older}"
             )
         try:
             document = json.loads(path.read_text())

@@ -24,8 +24,8 @@ def test_students_are_played_beside_their_planner(tmp_path: Path, capsys: pytest
     run, file = write_run(tmp_path / "run-v0", SAID, (0, 2), 90, checkpoint=True), tmp_path / "distillation.json"
     words = [str(run), "--settings", json.dumps(TINY), "--delays", "0", "2", "--episodes", "2", "--calls", "3",
              "--onnx", "--json", str(file)]  # fmt: skip
-    rows = script.main([*words, "--seeds", "5", "--q-weights", "0.5"])
-    name = "student, q_weight 0.5, seed 5"
+    rows = script.main([*words, "--seeds", "5"])
+    name = "student, seed 5"
     assert set(rows) == {"planner", name} and json.loads(file.read_text())["rows"] == rows
     assert rows[name]["error"] > 0 and rows[name]["onnx"]["n_calls"] == rows["planner"]["predict"]["n_calls"] == 3
     out = capsys.readouterr().out
@@ -33,13 +33,13 @@ def test_students_are_played_beside_their_planner(tmp_path: Path, capsys: pytest
 
     model = open_run(run)
     model.seed = 5
-    assert model.distill(q_weight=0.5, **TINY) == rows[name]["error"]
+    assert model.distill(**TINY) == rows[name]["error"]
     make_env = load_run(run, delay=2, device="cpu").make_env
     for who, row in (("planner", "planner"), ("student", name)):
         with model.policy.answering(who):
             assert rollout(model, make_env, 2, 10_000, 20).returns.tolist() == rows[row]["returns"]["2"]
 
-    assert script.main([*words, "--seeds", "5", "--q-weights", "0.5"]) == rows
+    assert script.main([*words, "--seeds", "5"]) == rows
     with pytest.raises(SystemExit):
         script.main([*words, "--episodes", "3"])
     assert "has rows of {" in capsys.readouterr().err
@@ -49,12 +49,12 @@ def test_a_log_takes_the_replays_place(tmp_path: Path) -> None:
     run, log, file = write_run(tmp_path / "run-v0", SAID, (0, 2), 90), tmp_path / "log.npz", tmp_path / "rows.json"
     collect.main([str(run), "--steps", "60", "--n-envs", "1", "-o", str(log), "--device", "cpu"])
     words = [str(run), "--log", str(log), "--settings", json.dumps(TINY), "--delays", "0", "2", "--episodes", "1"]
-    rows = script.main([*words, "--calls", "1", "--q-weights", "0.5", "--json", str(file)])
+    rows = script.main([*words, "--calls", "1", "--json", str(file)])
 
     model = script.open_with_log(run, log)
     assert model.replay_buffer.size() == 60
     model.seed = 1
-    assert model.distill(q_weight=0.5, **TINY) == rows["student, q_weight 0.5, seed 1"]["error"]
+    assert model.distill(**TINY) == rows["student, seed 1"]["error"]
     write_run(tmp_path / "expert-v0", DelayedSAC, 2)
     with pytest.raises(ValueError, match="DelayedSAC; give a SAID agent"):
         script.open_with_log(tmp_path / "expert-v0", log)

@@ -1,4 +1,4 @@
-"""How a student learns: its labels, where it goes itself, and what the critics have to say."""
+"""How a student learns: its labels, and where it goes itself."""
 
 import numpy as np
 import pytest
@@ -8,11 +8,11 @@ from small_student import QUICK, taught_agent, with_answers
 from small_task import Drift, delayed
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
-from torch.nn import functional as F
 from watching import watch_adam, watch_samples
 
 from sb3_said.sac.extractors import StateAugmentedExtractor
 from sb3_said.said import distillation
+from sb3_said.said.student import Student
 
 
 @pytest.fixture(scope="module")
@@ -34,13 +34,13 @@ def pupil(taught):
 
 
 def test_its_error_is_over_rows_that_it_did_not_learn_from_and_its_rate_falls_to_0(pupil, monkeypatch):
-    learned_from, loss, steps = [], distillation._loss, watch_adam(monkeypatch)
+    learned_from, answer, steps = [], Student.answer, watch_adam(monkeypatch)
 
-    def recorded(model, batch, q_weight):
-        learned_from.append(batch.inputs)
-        return loss(model, batch, q_weight)
+    def recorded(student, inputs):
+        learned_from.append(inputs)
+        return answer(student, inputs)
 
-    monkeypatch.setattr(distillation, "_loss", recorded)
+    monkeypatch.setattr(Student, "answer", recorded)
     pupil.planner_newest_fraction = 0.5  # of 60 steps
     try:
         error = pupil.distill(**{**QUICK, "own_steps": 0, "gradient_steps": 100}, learning_rate=0.01)
@@ -48,7 +48,7 @@ def test_its_error_is_over_rows_that_it_did_not_learn_from_and_its_rate_falls_to
         parts = [replayed(pupil, generator) for _ in range(2)]
     finally:
         pupil.planner_newest_fraction = 1.0
-    inputs, labels = (th.cat([getattr(part, name) for part in parts])[:700] for name in ("inputs", "labels"))
+    inputs, labels = (th.cat(part)[:700] for part in zip(*parts, strict=True))
     newest = pupil.replay_buffer.observations[30:60, 0]
     assert {tuple(x) for x in inputs[:, :2].tolist()} <= {tuple(x) for x in newest.tolist()}
     student = pupil.policy.student
@@ -71,20 +71,19 @@ def test_the_labels_are_the_planners_at_temperature_0_at_every_age(taught, monke
         return made
 
     monkeypatch.setattr(model.policy.planner, "plan", recorded)
-    rows = replayed(model, th.Generator().manual_seed(0))
+    inputs, labels = replayed(model, th.Generator().manual_seed(0))
     ((states, history, delay), kwargs, action) = seen[0]
     assert kwargs == {"temperature": 0.0} and sorted(set(delay.tolist())) == [0, 1, 2]
-    assert th.equal(rows.labels, action)
+    assert th.equal(labels, action)
     reader = StateAugmentedExtractor(model.observation_space)
     obs = {"observation": states, "action_history": history, "delay": delay[:, None].float()}
-    assert th.equal(rows.inputs, reader(obs))
-    # Each row is a place of the replay: the state, the actions from there on, and the state that they lead to
+    assert th.equal(inputs, reader(obs))
+    # Each row is a place of the replay: the state, and the actions from there on, which end no episode
     buffer, stored = model.replay_buffer, model.replay_buffer.observations[:, 0]
     for k in range(20):
         age, (place, *_) = int(delay[k]), np.flatnonzero((stored == states[k].numpy()).all(1))
-        np.testing.assert_array_equal(rows.presents[k], stored[place + age])
         np.testing.assert_array_equal(history[k, 2 - age :], buffer.actions[place : place + age, 0])
-        assert not history[k, : 2 - age].any()
+        assert not history[k, : 2 - age].any() and not buffer.dones[place : place + age].any()
 
 
 @pytest.mark.parametrize("is_delayed", [True, False])
@@ -92,11 +91,11 @@ def test_the_labels_are_the_actors_where_it_decides_on_the_guess(is_delayed):
     model = make(env=None if is_delayed else Drift(length=30)).learn(60)
     model.set_planner(decided_by="actor")
     model.policy.make_student(8)
-    rows = distillation._visited(model, "planner", 25, th.Generator().manual_seed(0))
+    _, labels = distillation._visited(model, "planner", 25, th.Generator().manual_seed(0))
     with model.borrowed_env() as env, model.policy.answering("planner"):
         env.seed(int(th.randint(2**31, (), generator=th.Generator().manual_seed(0))))
         obs = env.reset()
-        for label in rows.labels:
+        for label in labels:
             action = model.predict(obs, deterministic=True)[0]
             np.testing.assert_allclose(model.policy.scale_action(action)[0], label, atol=1e-5)
             obs = env.step(action)[0]
@@ -112,36 +111,14 @@ def test_it_learns_where_it_goes_itself(pupil, monkeypatch):
     monkeypatch.setattr(distillation, "_visited", recorded)
     pupil.distill(**{**QUICK, "n_labels": 100, "gradient_steps": 30})
     assert visits == [("student", 30), ("student", 30)]
-    rows = visited(pupil, "student", 30, th.Generator())
-    assert rows.inputs.shape == (30, 2 + 2 + 1) and rows.presents.isnan().all()
+    inputs, _ = visited(pupil, "student", 30, th.Generator())
+    assert inputs.shape == (30, 2 + 2 + 1)
     with th.no_grad():  # in Drift the action moves the first entry of the state, and is the last of the next history
-        states, history = rows.inputs[:, :2], rows.inputs[:, 2:4]
-        own = pupil.policy.student.answer(rows.inputs)
-    follows = rows.inputs[:-1, -1] <= rows.inputs[1:, -1]  # where no episode ends
+        states, history = inputs[:, :2], inputs[:, 2:4]
+        own = pupil.policy.student.answer(inputs)
+    follows = inputs[:-1, -1] <= inputs[1:, -1]  # where no episode ends
     th.testing.assert_close(history[1:, -1][follows], own[:-1, 0][follows], rtol=1e-5, atol=1e-6)
     assert states.std() > 0 and pupil._last_obs is None  # the next learn() starts a new episode
-
-
-def test_the_critics_can_have_a_say(pupil):
-    def taught_by(q_weight):
-        pupil.distill(**{**QUICK, "own_steps": 0, "q_weight": q_weight})
-        rows = replayed(pupil, th.Generator().manual_seed(1))
-        with th.no_grad():
-            answers = pupil.policy.student.answer(rows.inputs)
-            return pupil.policy.q_value(rows.presents, answers).mean(), (answers - rows.labels).square().mean()
-
-    (plain_q, plain_error), (q, error) = taught_by(0.0), taught_by(0.5)
-    assert q > plain_q and error > plain_error
-
-
-def test_their_say_is_in_mean_sizes_of_q(taught):
-    rows = replayed(taught, th.Generator().manual_seed(1))
-    unknown = distillation._Rows(rows.inputs[:9], rows.labels[:9], th.full_like(rows.presents[:9], th.nan))
-    answers = taught.policy.student.answer(rows.inputs)
-    q = taught.policy.q_value(rows.presents, answers)
-    errors = [F.mse_loss(answers, rows.labels), F.mse_loss(answers[:9], rows.labels[:9])]
-    th.testing.assert_close(distillation._loss(taught, rows, 0.3), errors[0] - 0.3 * q.mean() / q.abs().mean())
-    th.testing.assert_close(distillation._loss(taught, unknown, 0.3), errors[1])
 
 
 @pytest.mark.parametrize("normalized", [False, True])
@@ -161,7 +138,7 @@ def test_without_delay_and_with_normalized_observations(normalized):
     [
         ({"width": 0}, "student_width must be a whole number, at least 1, got 0"),
         ({"batch_size": 0}, "batch_size is 0, expected at least 1"),
-        ({"q_weight": -1.0}, "q_weight is -1.0, expected at least 0"),
+        ({"own_steps": -1}, "own_steps is -1, expected at least 0"),
         ({"n_labels": 1e2}, "n_labels is 100.0, expected a whole number"),
         ({"learning_rate": 0.0}, "learning_rate is 0.0, expected a number above 0"),
     ],
@@ -213,11 +190,11 @@ def test_a_planner_of_one_age_teaches_at_that_age():
     kwargs = {"learning_starts": 100, "planner_gradient_steps": 1}
     model = make(planner_kwargs={"mask": "fixed", "temperature": 0.0}, **kwargs).learn(60)
     model.policy.make_student(8)
-    ages = replayed(model, th.Generator().manual_seed(0)).inputs[:, -1]
+    ages = replayed(model, th.Generator().manual_seed(0))[0][:, -1]
     assert set(ages.tolist()) <= {0.0, 0.5, 1.0} and (ages == 1).float().mean() > 0.7  # smaller at an episode's end
 
 
 def test_several_environments_take_as_many_steps_together():
     model = make(DummyVecEnv([delayed] * 2))
     model.policy.make_student(8)
-    assert len(distillation._visited(model, "expert", 10, th.Generator()).inputs) == 10
+    assert len(distillation._visited(model, "expert", 10, th.Generator())[0]) == 10
