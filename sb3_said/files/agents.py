@@ -1,4 +1,4 @@
-"""Agents and policies in files without pickle: constructor arguments, counters and state dicts, and nothing else."""
+"""Agents and policies in files without pickle: arguments, counters, recent episodes, state dicts, and nothing else."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import math
 import os
 import pathlib
 import warnings
+from collections import deque
 from collections.abc import Iterable
 from typing import Any, ClassVar, TypeVar
 
@@ -340,6 +341,11 @@ def agent_state(model: SafeSaveMixin) -> dict[str, Any]:
     parameters = model.get_parameters()
     return {
         "counters": {name: _plain(name, getattr(model, name)) for name in model.counters},
+        "episodes": {
+            "returns": [float(episode["r"]) for episode in model.ep_info_buffer or ()],
+            "lengths": [int(episode["l"]) for episode in model.ep_info_buffer or ()],
+            "successes": [float(success) for success in model.ep_success_buffer or ()],
+        },
         "parameters": {name: part["state"] if "param_groups" in part else part for name, part in parameters.items()},
         "variables": {name: getattr(model, name).detach() for name in model._get_torch_save_params()[1]},
     }
@@ -362,11 +368,24 @@ def restore_agent(model: SafeSaveMixin, saved: dict[str, Any]) -> None:
     parameters = _fitting_parameters(model, saved["parameters"])
     own = {name: getattr(model, name).data for name in model._get_torch_save_params()[1]}
     check_tensors("variables", saved["variables"], own)
+    _recall_episodes(model, saved.get("episodes"))
     for name in model.counters:
         setattr(model, name, saved["counters"][name])
     _take_parameters(model, parameters)
     for name, value in own.items():
         value.copy_(saved["variables"][name])
+
+
+def _recall_episodes(model: SafeSaveMixin, saved: dict[str, list[float]] | None) -> None:
+    """Take over the recent episodes, whose mean return and length SB3 logs; an older file has none."""
+    if saved is None:
+        return
+    check_names("episodes", saved, ("returns", "lengths", "successes"))
+    if any(type(x) not in (int, float) for values in saved.values() for x in values):
+        raise SavedFileError("its part 'episodes' holds more than numbers")
+    episodes = zip(saved["returns"], saved["lengths"], strict=True)
+    model.ep_info_buffer = deque(({"r": r, "l": n} for r, n in episodes), maxlen=model._stats_window_size)
+    model.ep_success_buffer = deque(saved["successes"], maxlen=model._stats_window_size)
 
 
 def _check_counters(model: SafeSaveMixin, saved: dict[str, Any]) -> None:

@@ -11,7 +11,7 @@ import pytest
 import torch as th
 from saving import OwnPolicy, forge, make_policy, make_sac, same
 from small_agent import make as make_agent
-from small_task import delayed
+from small_task import Drift, delayed
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
@@ -431,6 +431,29 @@ def test_what_is_too_large_for_half_precision_stays_whole(tmp_path):
         model.actor.mu.weight[0, 0] = 1e6
     model.save(tmp_path / "compact.zip", compact=True)
     assert DelayedSAC.load(tmp_path / "compact.zip", device="cpu").actor.mu.weight[0, 0] == 1e6
+
+
+@pytest.mark.parametrize("cls", [DelayedSAC, SAID])
+def test_the_recent_episodes_go_on_where_they_were(cls, tmp_path):
+    """As in SB3, whose curves of the mean return would begin anew otherwise."""
+    model = make_agent(Drift(length=7), cls=cls).learn(45)
+    model.ep_success_buffer.extend([True, False])  # as of a task that tells of them
+    model.ep_info_buffer[0]["r"] = np.inf  # of a task that fails
+    recent = [(episode["r"], episode["l"]) for episode in model.ep_info_buffer]
+    assert len(recent) == 6
+    model.save(tmp_path / "agent.zip")
+    loaded = cls.load(tmp_path / "agent.zip", env=model.get_env(), device="cpu")
+    loaded.learn(7, reset_num_timesteps=False)
+    found = [(episode["r"], episode["l"]) for episode in loaded.ep_info_buffer]
+    assert found[:6] == recent and found[6:] == [(7.0, 7)] and list(loaded.ep_success_buffer) == [1.0, 0.0]
+    short = cls.load(tmp_path / "agent.zip", device="cpu", stats_window_size=1)
+    assert [len(short.ep_info_buffer), len(short.ep_success_buffer)] == [1, 1]
+    loaded.learn(7)
+    assert len(loaded.ep_info_buffer) == 1  # another training
+
+    part = {"episodes": {"returns": [1.0], "lengths": ["7"], "successes": []}}
+    with pytest.raises(SavedFileError, match="'episodes' holds more than numbers"):
+        restore_agent(model, agent_state(model) | part)
 
 
 def test_the_file_names_the_task(tmp_path):
