@@ -401,7 +401,10 @@ class DelayedSAC(SafeSaveMixin, SAC):
         """Write the replay buffer to a file without pickle.
 
         :param path: of the file, to which ``.pkl`` is added where it has no suffix, or a binary file object
+        :raises ValueError: where the agent has no replay buffer any more
         """
+        if self.replay_buffer is None:
+            raise ValueError("This agent's replay_buffer is None: save the replay before it is taken away.")
         file = with_suffix(path, ".pkl")  # type: ignore[arg-type]  # io.BufferedIOBase is IO, as in loading
         save_tree(file, self.replay_buffer.state_dict(), kind=REPLAY)
 

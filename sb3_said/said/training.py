@@ -149,7 +149,9 @@ class PlannerTraining:
             entries.clear()
         for key, value in values.items():
             logger.record(key, value)
-        logger.dump(self.row(self.trainer.n_updates))
+        row = self.row(self.trainer.n_updates)
+        logger.record("time/total_timesteps", row, exclude="tensorboard")  # as SB3's evaluations do: a CSV has no other
+        logger.dump(row)
         for entries, before in pending:
             entries.clear()  # a logger that is disabled has not written them
             entries.update(before)

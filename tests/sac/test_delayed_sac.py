@@ -223,10 +223,8 @@ def test_replay_is_saved_without_pickle(tmp_path):
     model.save(tmp_path / "agent.zip")
     with pytest.raises(SavedFileError, match="of kind 'DelayedSAC', where 'replay buffer' was expected"):
         other.load_replay_buffer(tmp_path / "agent.zip")
-    save_tree(tmp_path / "of_before.pkl", model.replay_buffer.state_dict())
-    other.load_replay_buffer(tmp_path / "of_before.pkl")
     for state in ({}, [], {**model.replay_buffer.state_dict(), "rewards": 3}):
-        save_tree(tmp_path / "forged", state)
+        save_tree(tmp_path / "forged", state, kind="replay buffer")
         with pytest.raises(SavedFileError, match="Cannot load"):
             other.load_replay_buffer(tmp_path / "forged")
 
@@ -238,6 +236,8 @@ def test_a_replay_is_loaded_where_there_is_none(tmp_path):
     model.replay_buffer, device = None, model.device
     with pytest.raises(FileNotFoundError):
         model.load_replay_buffer(tmp_path / "another")
+    with pytest.raises(ValueError, match="replay_buffer is None: save the replay before"):
+        model.save_replay_buffer(tmp_path / "another")
     assert model.replay_buffer is None
     model.load_replay_buffer(tmp_path / "replay")
     again = model.replay_buffer

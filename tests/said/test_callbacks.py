@@ -227,6 +227,7 @@ def test_losses_are_logged_and_a_bar_is_shown(capsys):
     rows = [row for row in memory.rows if "planner/loss" in row]
     assert [row["planner/n_updates"] for row in rows] == [2, 4, 5]
     assert [row["step"] for row in rows] == [82, 84, 85]  # nothing comes after, and a curve needs an axis
+    assert [row["time/total_timesteps"] for row in rows] == [82, 84, 85]  # in a CSV, too
     assert all(np.isfinite(row["planner/loss"]) and row["planner/loss"] > 0 for row in rows)
     assert ["planner/present_error_d2" in row for row in rows] == [False, True, True]
     shown = capsys.readouterr().err
@@ -243,7 +244,8 @@ def test_rows_of_the_planner_are_its_own_and_in_order():
     of_planner = [row for row in memory.rows if "planner/loss" in row]
     of_expert = [row for row in memory.rows if "planner/loss" not in row]
     assert [row["planner/n_updates"] for row in of_planner] == 3 * [2, 4, 6]
-    assert all(key.startswith("planner/") or key == "step" for row in of_planner for key in row)
+    axes = {"step", "time/total_timesteps"}
+    assert all(key.startswith("planner/") for row in of_planner for key in row.keys() - axes)
     assert not any(key.startswith("planner/") for row in of_expert for key in row)
     steps = [row["step"] for row in memory.rows]
     assert steps == sorted(steps) and len(set(steps)) > 3
