@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -121,32 +122,25 @@ class PlannerLearner(PlannerAgent):
             self._logger = configure_logger(self.verbose, self.tensorboard_log, "SAID", reset_num_timesteps=False)
 
         is_tried = n_episodes > 0 and self._can_be_tried()
-
-        def train(planner: InpaintingPlanner, *before: InpaintingPlanner) -> tuple[PlannerTraining, str]:
-            def row(n_updates: int) -> int:
-                n_made = len(before) * trainer.gradient_steps + n_updates
-                return self.num_timesteps + (n_made if self.planner_train_freq is None else 0)
-
-            trainer, intervals = self.make_planner_trainer(gradient_steps, planner), (log_interval, eval_interval)
-            values = None if before else self._make_value_trainer()
-            training = PlannerTraining(self, trainer, values, row, folder, *intervals, save_interval)
-            if before:
-                trainer.take_first_guess(before[0])  # of the same data
+        planners, config = [self.policy.planner], self.policy.planner.config
+        for mask in masks_of(self)[1:] if is_tried else []:
+            planners.append(self.policy.new_planner(in_way(config, {"mask": mask})))
+        for k, planner in enumerate(planners):
+            trainer = self.make_planner_trainer(gradient_steps, planner)
+            values = self._make_value_trainer() if k == 0 else None
+            row = partial(self._planner_row, k * trainer.gradient_steps)
+            training = PlannerTraining(self, trainer, values, row, folder, log_interval, eval_interval, save_interval)
+            if k > 0:
+                trainer.take_first_guess(planners[0])  # of the same data
             if trainer.n_updates < trainer.gradient_steps and not progress_bar and self.verbose == 0:
                 print(
                     f"Training the {training.name}: {trainer.gradient_steps} updates. progress_bar=True or verbose=1 "
                     "shows how far it is.",
                     flush=True,
                 )
-            return training, training.run(progress_bar, should_stop)
-
-        training, outcome = train(self.policy.planner)
-        planners = [self.policy.planner]
-        for mask in masks_of(self)[1:] if is_tried else []:
-            if outcome == "done":
-                planner = self.policy.new_planner(in_way(self.policy.planner.config, {"mask": mask}))
-                training, outcome = train(planner, *planners)
-                planners.append(planner)
+            outcome = training.run(progress_bar, should_stop)
+            if outcome != "done":
+                break
         if is_tried and outcome == "done":
             with stopped_alone():
                 training.log(
@@ -235,6 +229,10 @@ class PlannerLearner(PlannerAgent):
             raise KeyboardInterrupt
         watcher.on_training_end()
         return self
+
+    def _planner_row(self, n_before: int, n_updates: int) -> int:
+        """Return where in the log a row of the planner stands, after updates of planners before it and its own."""
+        return self.num_timesteps + (n_before + n_updates if self.planner_train_freq is None else 0)
 
     def _check_decider(self, decided_by: str | None) -> None:
         """:raises ValueError: for the actor, where no expert has learned"""
