@@ -22,7 +22,7 @@ EPISODES := 20
 AGENTS := window_weights/hopper_seed1 window_weights/hopper_seed2 window_weights/hopper_seed3 \
 	window_weights/walker2d_seed1 window_weights/walker2d_seed2 window_weights/walker2d_seed3 \
 	window_weights/halfcheetah_seed1 window_weights/halfcheetah_seed2 window_weights/halfcheetah_seed3 \
-	steps_at_once/ant_seed1 window_weights/ant_seed2 steps_at_once/ant_seed3
+	window_weights/ant_seed1 window_weights/ant_seed2 window_weights/ant_seed3
 
 .PHONY: install train report demo test lint type pytest format clean
 
