@@ -51,10 +51,10 @@ from tqdm import tqdm
 
 from sb3_said import SAID, DelayedObservationWrapper, PlannerConfig
 from sb3_said.evaluation import confidence_interval, rollout
-from sb3_said.files.agents import restore_agent
 from sb3_said.files.archive import load_tree
 from sb3_said.files.atomic import write_json
 from sb3_said.files.checkpoint import CHECKPOINT_NAME
+from sb3_said.files.state import restore_agent
 from sb3_said.offline.belief import BeliefOnly, PlannerBelief
 from sb3_said.planner import InpaintingPlanner
 from sb3_said.planner.inpainting import newest

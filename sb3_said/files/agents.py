@@ -4,24 +4,27 @@ from __future__ import annotations
 
 import contextlib
 import inspect
-import math
-import os
-import pathlib
 import warnings
-from collections import deque
 from collections.abc import Iterable
 from typing import Any, ClassVar, TypeVar
 
 import gymnasium as gym
-import numpy as np
 import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import ConstantSchedule, get_device, get_system_info
 
-from sb3_said.files.archive import PathOrFile, SavedFileError, load_metadata, load_tree, readable, save_tree
+from sb3_said.files.archive import (
+    PathOrFile,
+    SavedFileError,
+    existing,
+    load_metadata,
+    load_tree,
+    readable,
+    save_tree,
+    with_suffix,
+)
 from sb3_said.files.arguments import (
     as_data,
     check_noise,
@@ -36,28 +39,31 @@ from sb3_said.files.checks import (
     check_argument,
     check_names,
     check_numbers,
-    check_optimizer_state,
     check_tensors,
     no_larger_than,
 )
-
-LARGEST_COUNT = 2**63 - 1
+from sb3_said.files.state import (
+    Learner,
+    agent_state,
+    check_counters,
+    fitting_parameters,
+    in_half,
+    restore_agent,
+    take_parameters,
+)
 
 SelfSafeSave = TypeVar("SelfSafeSave", bound="SafeSaveMixin")
 SelfSafePolicy = TypeVar("SelfSafePolicy", bound="SafePolicyMixin")
 
 
-class SafeSaveMixin(OffPolicyAlgorithm):
+class SafeSaveMixin(Learner):
     """Makes an SB3 off-policy algorithm save to and load from files without pickle. Name it before the algorithm.
 
-    Every argument of the constructor after ``policy, env`` must be an attribute of the same name. A subclass adds what
-    it counts to ``counters``, to ``own_classes`` the classes that its constructor takes where none are given, and to
-    ``settings_arguments`` those of its arguments that are dicts of settings, which ``load`` merges entry by entry.
+    Every argument of the constructor after ``policy, env`` must be an attribute of the same name. A subclass adds to
+    ``own_classes`` the classes that its constructor takes where none are given, and to ``settings_arguments`` those of
+    its arguments that are dicts of settings, which ``load`` merges entry by entry.
     """
 
-    counters: ClassVar[tuple[str, ...]] = (
-        "num_timesteps", "_total_timesteps", "_episode_num", "_n_updates", "_current_progress_remaining"
-    )  # fmt: skip
     own_classes: ClassVar[tuple[type, ...]] = ()
     settings_arguments: ClassVar[tuple[str, ...]] = ()
 
@@ -108,7 +114,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
             tree["parameters"] = {name: {} if "optimizer" in name else part for name, part in parameters.items()}
             learned = {name for name, _ in self.policy.named_parameters()}
             tree["parameters"]["policy"] = {
-                name: _in_half(value) if name in learned else value for name, value in parameters["policy"].items()
+                name: in_half(value) if name in learned else value for name, value in parameters["policy"].items()
             }
         metadata = {"task": self.task, "reads_normalized": self.reads_normalized}
         save_tree(with_suffix(path, ".zip"), tree, metadata, kind=type(self).__name__)
@@ -147,14 +153,7 @@ class SafeSaveMixin(OffPolicyAlgorithm):
         given = {name: value for name, value in (custom_objects or {}).items() if name in names}
         saved = load_tree(path, cls.__name__)
         with readable(path):
-            check_names("arguments", saved["arguments"], names, exact=False)
-            nodes = {name: node for name, node in saved["arguments"].items() if name not in given}
-            check_numbers("arguments", nodes)
-            arguments = {name: from_data(node) for name, node in nodes.items()}
-            policy_class = arguments.get("policy_class", cls.policy_aliases["MlpPolicy"])
-            for name, value in arguments.items():
-                cls._check_argument(name, value, policy_class)
-            arguments |= given
+            arguments = cls._read_arguments(saved["arguments"], given)
             observation_space, action_space = map(space_from_data, saved["spaces"])
             check_noise(arguments.get("action_noise"), action_space)
             if type(saved["n_envs"]) is not int or saved["n_envs"] < 1:
@@ -165,21 +164,14 @@ class SafeSaveMixin(OffPolicyAlgorithm):
                     " others.",
                     stacklevel=2,
                 )
-        stored = arguments.get("policy_kwargs")
-        if stored is not None and kwargs.get("policy_kwargs", stored) != stored:
-            raise ValueError(
-                f"The given policy_kwargs {kwargs['policy_kwargs']} differ from {stored} in the file, which the saved"
-                " networks were built with. Leave them out of the call."
-            )
-        for name, value in kwargs.items():
-            cls._check_argument(name, value, policy_class)  # no fault of the file
+        cls._check_changes(arguments, kwargs)  # no fault of the file
         others = replaced(arguments, kwargs)
         arguments = with_given(arguments, kwargs, cls.settings_arguments)
         policy = arguments.pop("policy_class", cls.policy_aliases["MlpPolicy"])
         with readable(path, explained=(ValueError, AssertionError)):  # SB3 asserts what it needs of an environment
             arguments |= {"device": device, "_init_setup_model": False}
             model = cls(policy, env, **arguments)  # type: ignore[arg-type]  # SB3 takes no env, too
-            _check_counters(model, saved["counters"])
+            check_counters(model, saved["counters"])
             for name in model.counters:  # _setup_model may ask whether the agent is new
                 setattr(model, name, saved["counters"][name])
             model.observation_space, model.action_space = observation_space, action_space
@@ -229,8 +221,35 @@ class SafeSaveMixin(OffPolicyAlgorithm):
             self._check_file(saved)
             n_updates = saved["counters"]["_n_updates"]
             check_numbers("_n_updates", n_updates)
-            _take_parameters(self, _fitting_parameters(self, saved["parameters"], exact_match), exact_match)
+            take_parameters(self, fitting_parameters(self, saved["parameters"], exact_match), exact_match)
             self._n_updates = max(self._n_updates, int(n_updates))  # that made them; a compact file shows no others
+
+    @classmethod
+    def _read_arguments(cls, saved: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+        """Return the constructor arguments of a file, with those that are given in their places.
+
+        :raises ValueError: for names, types or numbers that the constructor does not take
+        """
+        check_names("arguments", saved, cls._argument_names(), exact=False)
+        nodes = {name: node for name, node in saved.items() if name not in given}
+        check_numbers("arguments", nodes)
+        arguments = {name: from_data(node) for name, node in nodes.items()}
+        policy_class = arguments.get("policy_class", cls.policy_aliases["MlpPolicy"])
+        for name, value in arguments.items():
+            cls._check_argument(name, value, policy_class)
+        return arguments | given
+
+    @classmethod
+    def _check_changes(cls, arguments: dict[str, Any], changes: dict[str, Any]) -> None:
+        """:raises ValueError: for other networks than a file's, and for what the constructor does not take"""
+        stored = arguments.get("policy_kwargs")
+        if stored is not None and changes.get("policy_kwargs", stored) != stored:
+            raise ValueError(
+                f"The given policy_kwargs {changes['policy_kwargs']} differ from {stored} in the file, which the saved"
+                " networks were built with. Leave them out of the call."
+            )
+        for name, value in changes.items():
+            cls._check_argument(name, value, arguments.get("policy_class", cls.policy_aliases["MlpPolicy"]))
 
     @classmethod
     def _check_argument(cls, name: str, value: Any, policy_class: type) -> None:
@@ -282,10 +301,6 @@ class SafeSaveMixin(OffPolicyAlgorithm):
         :raises ValueError: for settings that do not go with this agent
         """
 
-    def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:
-        """Return the state dicts to take over from those given; an algorithm may keep some of its own."""
-        return params
-
 
 def task_of(metadata: dict[str, Any]) -> str | None:
     """Return the task that an agent's file names; none whose id names a module, which ``gymnasium.make`` would import.
@@ -334,127 +349,3 @@ class SafePolicyMixin(BasePolicy):
         if arguments.get("use_sde"):  # its noise was drawn before the parameters were there
             policy.reset_noise()  # type: ignore[operator]  # policies with gSDE have it
         return policy
-
-
-def agent_state(model: SafeSaveMixin) -> dict[str, Any]:
-    """Return what learning has changed, as a tree; of optimizers only the state, as their settings are arguments."""
-    parameters = model.get_parameters()
-    return {
-        "counters": {name: _plain(name, getattr(model, name)) for name in model.counters},
-        "episodes": {
-            "returns": [float(episode["r"]) for episode in model.ep_info_buffer or ()],
-            "lengths": [int(episode["l"]) for episode in model.ep_info_buffer or ()],
-            "successes": [float(success) for success in model.ep_success_buffer or ()],
-        },
-        "parameters": {name: part["state"] if "param_groups" in part else part for name, part in parameters.items()},
-        "variables": {name: getattr(model, name).detach() for name in model._get_torch_save_params()[1]},
-    }
-
-
-def _plain(name: str, value: Any) -> Any:
-    """Return a counter as a file has it: ``learn(1e6)``, ``learn(inf)`` and NumPy's numbers leave others."""
-    value = value.item() if isinstance(value, np.generic) else value
-    if name == "_current_progress_remaining" or not isinstance(value, float):
-        return value
-    return min(math.ceil(value), LARGEST_COUNT) if math.isfinite(value) else LARGEST_COUNT
-
-
-def restore_agent(model: SafeSaveMixin, saved: dict[str, Any]) -> None:
-    """Take over what :func:`agent_state` returned, once it is known to fit the model's own.
-
-    :raises SavedFileError: for parts of other names, shapes or types, or that are not finite
-    """
-    _check_counters(model, saved["counters"])
-    parameters = _fitting_parameters(model, saved["parameters"])
-    own = {name: getattr(model, name).data for name in model._get_torch_save_params()[1]}
-    check_tensors("variables", saved["variables"], own)
-    _recall_episodes(model, saved.get("episodes"))
-    for name in model.counters:
-        setattr(model, name, saved["counters"][name])
-    _take_parameters(model, parameters)
-    for name, value in own.items():
-        value.copy_(saved["variables"][name])
-
-
-def _recall_episodes(model: SafeSaveMixin, saved: dict[str, list[float]] | None) -> None:
-    """Take over the recent episodes, whose mean return and length SB3 logs; an older file has none."""
-    if saved is None:
-        return
-    check_names("episodes", saved, ("returns", "lengths", "successes"))
-    if any(type(x) not in (int, float) for values in saved.values() for x in values):
-        raise SavedFileError("its part 'episodes' holds more than numbers")
-    episodes = zip(saved["returns"], saved["lengths"], strict=True)
-    model.ep_info_buffer = deque(({"r": r, "l": n} for r, n in episodes), maxlen=model._stats_window_size)
-    model.ep_success_buffer = deque(saved["successes"], maxlen=model._stats_window_size)
-
-
-def _check_counters(model: SafeSaveMixin, saved: dict[str, Any]) -> None:
-    check_names("counters", saved, model.counters)
-    for name in model.counters:
-        value, own = saved[name], getattr(model, name)
-        if isinstance(own, int):
-            fits = type(value) is int and 0 <= value <= LARGEST_COUNT
-        elif isinstance(own, float):
-            fits = type(value) is float and math.isfinite(value)
-        else:  # ages, where it has learned
-            fits = value is None or (type(value) is list and all(type(x) is int and 0 <= x < 2**31 for x in value))
-        if not fits:
-            raise SavedFileError(f"its part 'counters' does not fit: {name} is {value!r:.50}")
-
-
-def _fitting_parameters(model: SafeSaveMixin, saved: dict[str, Any], exact: bool = True) -> dict[str, Any]:
-    """Return what a model takes over of saved networks and optimizers, once it is known to fit."""
-    saved, own = model._adapt_parameters(saved), model.get_parameters()
-    check_names("parameters", saved, own, exact)
-    saved = {name: _in_full(state, own[name]) for name, state in saved.items()}
-    for name, state in saved.items():
-        target = recursive_getattr(model, name)
-        if isinstance(target, th.optim.Optimizer):
-            check_optimizer_state(name, state, target)
-        else:
-            check_tensors(name, state, own[name], exact)
-    return saved
-
-
-def _in_half(value: th.Tensor) -> th.Tensor:
-    """Return a matrix as float16, if it is one of float32 that stays finite."""
-    half = value.half() if value.dtype == th.float32 and value.ndim > 1 else value
-    return half if half.isfinite().all() else value
-
-
-def _in_full(state: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
-    """Return tensors that :func:`_in_half` wrote in the types of the model's own."""
-
-    def full(name: str, value: Any) -> Any:
-        is_half = isinstance(value, th.Tensor) and value.dtype == th.float16 and isinstance(own.get(name), th.Tensor)
-        return value.to(own[name].dtype) if is_half else value
-
-    return {name: full(name, value) for name, value in state.items()}
-
-
-def _take_parameters(model: SafeSaveMixin, saved: dict[str, Any], exact: bool = True) -> None:
-    for name, state in saved.items():
-        target = recursive_getattr(model, name)
-        if isinstance(target, th.optim.Optimizer):
-            target.load_state_dict({**target.state_dict(), "state": state})
-        else:
-            target.load_state_dict(state, strict=exact)
-
-
-def with_suffix(path: PathOrFile, suffix: str) -> PathOrFile:
-    """Add a suffix to the path of a new file that has none, as SB3 does."""
-    if isinstance(path, (str, os.PathLike)) and pathlib.Path(path).suffix == "":
-        return f"{os.fspath(path)}{suffix}"
-    return path
-
-
-def existing(path: PathOrFile, suffix: str = ".zip") -> PathOrFile:
-    """Add a suffix where the path alone is no file, as SB3 does.
-
-    :raises FileNotFoundError: where neither is one
-    """
-    if isinstance(path, (str, os.PathLike)) and not os.path.isfile(path):
-        alone, path = os.fspath(path), f"{os.fspath(path)}{suffix}"
-        if not os.path.isfile(path):
-            raise FileNotFoundError(f"There is no file '{alone}' and no '{path}'.")
-    return path

@@ -11,6 +11,7 @@ import hashlib
 import json
 import math
 import os
+import pathlib
 import sys
 import zipfile
 from collections import OrderedDict
@@ -256,3 +257,22 @@ def _read_array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
 def _check_dtype(dtype: np.dtype) -> None:
     if dtype.kind not in "biufc":
         raise SavedFileError(f"arrays must be of numbers or bools, not {dtype}")
+
+
+def with_suffix(path: PathOrFile, suffix: str) -> PathOrFile:
+    """Add a suffix to the path of a new file that has none, as SB3 does."""
+    if isinstance(path, (str, os.PathLike)) and pathlib.Path(path).suffix == "":
+        return f"{os.fspath(path)}{suffix}"
+    return path
+
+
+def existing(path: PathOrFile, suffix: str = ".zip") -> PathOrFile:
+    """Add a suffix where the path alone is no file, as SB3 does.
+
+    :raises FileNotFoundError: where neither is one
+    """
+    if isinstance(path, (str, os.PathLike)) and not os.path.isfile(path):
+        alone, path = os.fspath(path), f"{os.fspath(path)}{suffix}"
+        if not os.path.isfile(path):
+            raise FileNotFoundError(f"There is no file '{alone}' and no '{path}'.")
+    return path

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
-import random
 import time
 import warnings
 import zlib
@@ -14,24 +12,18 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.callbacks import (
-    BaseCallback,
-    CallbackList,
-    EvalCallback,
-    EventCallback,
-    StopTrainingOnNoModelImprovement,
-)
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_said.files.agents import SafeSaveMixin, agent_state, restore_agent
+from sb3_said.files.agents import SafeSaveMixin
 from sb3_said.files.archive import SavedFileError, load_metadata, load_tree, readable, save_tree
 from sb3_said.files.arguments import as_data
+from sb3_said.files.evaluations import evaluations_of, restore_evaluations
 from sb3_said.files.normalization import check_statistics, get_statistics, set_statistics
+from sb3_said.files.random_states import check_random_state, random_state, restore_random_state
+from sb3_said.files.state import agent_state, restore_agent
 
 CHECKPOINT_NAME = "checkpoint.zip"
-_EVALUATION = ("n_calls", "best_mean_reward", "evaluations_timesteps", "evaluations_results", "evaluations_length")
-_SUCCESSES = "evaluations_successes"  # of tasks that tell them, and empty for others
-_PATIENCE = "no_improvement"  # of callbacks that stop where nothing has improved: the best mean, and evaluations since
 
 SECONDS = 600.0  # of training between two checkpoints, at least
 BYTES_A_SECOND = 500_000  # that checkpoints write at most, over the whole training
@@ -221,45 +213,6 @@ def crc32(arrays: Iterable[np.ndarray]) -> int:
     return functools.reduce(lambda found, array: zlib.crc32(np.ascontiguousarray(array).data, found), arrays, 0)
 
 
-def evaluations_of(callback: BaseCallback | None) -> list[dict[str, Any]]:
-    """Return the evaluations that each ``EvalCallback`` has made so far."""
-    return [
-        {
-            **{name: np.array(getattr(evaluation, name)).tolist() for name in (*_EVALUATION, _SUCCESSES)},
-            _PATIENCE: [[float(one.last_best_mean_reward), one.no_improvement_evals] for one in _stoppers(evaluation)],
-        }
-        for evaluation in _eval_callbacks(callback)
-    ]
-
-
-def restore_evaluations(callback: BaseCallback | None, saved: list[dict[str, Any]]) -> None:
-    """Give each ``EvalCallback`` what :func:`evaluations_of` returned.
-
-    :raises ValueError: for another number of them, or of their episodes
-    :raises SavedFileError: for evaluations other than an EvalCallback's
-    """
-    eval_callbacks = _eval_callbacks(callback)
-    if len(eval_callbacks) != len(saved):
-        raise ValueError(
-            f"the run had {len(saved)} EvalCallback and is resumed with {len(eval_callbacks)}; resume with the "
-            "callbacks of the run"
-        )
-    for eval_callback, kept in zip(eval_callbacks, saved, strict=True):
-        _check_evaluation(kept)
-        n_episodes = {np.size(returns) for returns in kept["evaluations_results"]}
-        if n_episodes - {eval_callback.n_eval_episodes}:  # its file, one array of all, could not be written
-            raise ValueError(
-                f"the run's evaluations are of {', '.join(map(str, n_episodes))} episodes and it is resumed with "
-                f"{eval_callback.n_eval_episodes}; resume with as many as before"
-            )
-    for eval_callback, kept in zip(eval_callbacks, saved, strict=True):
-        for name in _EVALUATION:
-            setattr(eval_callback, name, kept[name])
-        eval_callback.evaluations_successes = kept[_SUCCESSES]
-        for stopper, (best, n) in zip(_stoppers(eval_callback), kept[_PATIENCE], strict=False):
-            stopper.last_best_mean_reward, stopper.no_improvement_evals = best, n
-
-
 def restore_training(model: SafeSaveMixin, path: str | Path, callback: BaseCallback | None = None) -> None:
     """Bring a newly made model to where a checkpoint was written. Its environment starts a new episode.
 
@@ -276,7 +229,7 @@ def restore_training(model: SafeSaveMixin, path: str | Path, callback: BaseCallb
     state = load_tree(path)
     with readable(path, explained=(ValueError,)):
         restore_evaluations(callback, state["evaluations"])
-        _check_random_state(state["random"])
+        check_random_state(state["random"])
         check_statistics(model.get_vec_normalize_env(), state["vec_normalize"])
         is_dataset = "checksum" in state["replay_buffer"]
         if is_dataset and state["replay_buffer"]["checksum"] != checksum(model):
@@ -296,74 +249,6 @@ def restore_training(model: SafeSaveMixin, path: str | Path, callback: BaseCallb
         model.action_space.seed(seed)
 
 
-def random_state() -> dict[str, Any]:
-    """Return the global random states of Python, NumPy and torch."""
-    name, keys, *numpy_rest = np.random.get_state(legacy=True)
-    state = {"python": random.getstate(), "numpy": [name, np.asarray(keys), *numpy_rest], "torch": th.get_rng_state()}
-    if th.cuda.is_initialized():  # a run on the CPU takes no memory of a GPU
-        state["cuda"] = th.cuda.get_rng_state_all()
-    return state
-
-
-def restore_random_state(state: dict[str, Any]) -> None:
-    """Restore what ``random_state`` returned.
-
-    :raises SavedFileError: for a state that NumPy's generator never has, which would crash the process
-    """
-    _check_random_state(state)
-    (version, internal, gauss), (name, keys, *rest) = state["python"], state["numpy"]
-    random.setstate((version, tuple(internal), gauss))
-    np.random.set_state((name, keys, *rest))
-    th.set_rng_state(state["torch"])
-    if "cuda" in state and th.cuda.is_available():
-        th.cuda.set_rng_state_all(state["cuda"][: th.cuda.device_count()])  # the machine before may have had more
-
-
-def _check_random_state(state: dict[str, Any]) -> None:
-    """:raises SavedFileError: for states that no generator has; their own checks let some pass"""
-    version, internal, gauss = state["python"]
-    random.Random().setstate((version, tuple(internal), gauss))  # raises, and no global generator has changed yet
-    name, keys, position, has_gauss, cached = state["numpy"]
-    if name != "MT19937" or type(position) is not int or not 0 <= position <= 624:
-        raise SavedFileError(f"NumPy's random state is {name!s:.20} at position {position!s:.20}, expected 0..624")
-    if not isinstance(keys, np.ndarray) or (keys.dtype, keys.shape) != (np.uint32, (624,)):
-        raise SavedFileError("NumPy's random state is not of 624 numbers")
-    if has_gauss not in (0, 1) or not all(x is None or _is_finite(x) for x in (gauss, cached)):
-        raise SavedFileError("a random state keeps a number that is not finite for its next draw")
-    probe = th.Generator()
-    probe.set_state(state["torch"])
-    if not th.randn(2, generator=probe, dtype=th.float64).isfinite().all():
-        raise SavedFileError("torch's random state draws numbers that are not finite")
-
-
-def _check_evaluation(saved: dict[str, Any]) -> None:
-    """:raises SavedFileError: for evaluations other than an EvalCallback's"""
-    best, results = saved["best_mean_reward"], [saved[name] for name in _EVALUATION[2:]]
-    if type(saved["n_calls"]) is not int or type(best) is not float or best != best:
-        raise SavedFileError(f"an evaluation has n_calls {saved['n_calls']!s:.20} and the best mean {best!s:.20}")
-    if any(type(rows) is not list or len(rows) != len(results[0]) for rows in results):
-        raise SavedFileError("evaluations differ in how many they are")
-    successes = saved[_SUCCESSES]
-    if type(successes) is not list or len(successes) > len(results[0]):  # fewer, where some evaluations told none
-        raise SavedFileError("evaluations differ in how many they are")
-    if any(np.asarray(rows).dtype.kind not in "bif" for rows in (*results, successes) if rows):
-        raise SavedFileError("evaluations hold more than numbers")
-    for mean, n in saved[_PATIENCE]:
-        if type(mean) is not float or mean != mean or type(n) is not int or n < 0:
-            raise SavedFileError(f"an evaluation has not improved on {mean!s:.20} for {n!s:.20}")
-
-
-def _stoppers(evaluation: EvalCallback) -> list[StopTrainingOnNoModelImprovement]:
-    """Return the callbacks below an ``EvalCallback`` that stop where nothing has improved."""
-    children = [evaluation.callback_on_new_best, evaluation.callback]
-    several = [one for child in children for one in (child.callbacks if isinstance(child, CallbackList) else [child])]
-    return [one for one in several if isinstance(one, StopTrainingOnNoModelImprovement)]
-
-
-def _is_finite(x: Any) -> bool:
-    return type(x) in (int, float) and math.isfinite(x)
-
-
 def _replay_buffer(model: OffPolicyAlgorithm) -> Any:
     if not hasattr(model.replay_buffer, "load_state_dict"):
         name = type(model.replay_buffer).__name__
@@ -371,11 +256,3 @@ def _replay_buffer(model: OffPolicyAlgorithm) -> Any:
             f"Checkpoints need a replay buffer with a state_dict, such as DelayedReplayBuffer, got {name}."
         )
     return model.replay_buffer
-
-
-def _eval_callbacks(callback: BaseCallback | None) -> list[EvalCallback]:
-    if isinstance(callback, CallbackList):  # nested: SB3's progress bar puts the run's list into another
-        return [found for child in callback.callbacks for found in _eval_callbacks(child)]
-    if isinstance(callback, EvalCallback):
-        return [callback]
-    return _eval_callbacks(callback.callback) if isinstance(callback, EventCallback) else []

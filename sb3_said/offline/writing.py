@@ -49,20 +49,6 @@ def check_target(target: str | os.PathLike[str]) -> None:
         raise ValueError(f"{folder} is there already; give another name or version, or remove it.")
 
 
-def _without_code(spec: EnvSpec, target: str) -> EnvSpec | None:
-    """Return a registration that a file can hold: code by its name, and none, with a warning, where it has none."""
-    code = spec.entry_point
-    name = getattr(code, "__qualname__", "")
-    if name.isidentifier():  # so no lambda, and not inside of something
-        spec.entry_point = f"{code.__module__}:{name}"
-    try:
-        spec.to_json()
-    except (ValueError, TypeError) as error:
-        warnings.warn(f"{target} will not say its task: {error}", stacklevel=3)
-        return None
-    return spec
-
-
 def write_dataset(
     data: Dataset, target: str | os.PathLike[str], env: gym.Env[Any, Any], about: str = "", algorithm: str = ""
 ) -> None:
@@ -76,35 +62,42 @@ def write_dataset(
     :raises ValueError: as :func:`check_target`
     """
     check_target(target)
-    state_space, action_space, _ = check_spaces(env.observation_space, env.action_space)
-    actions, spec = unscale_action(data.actions, action_space), env.unwrapped.spec
     if is_file(target):
-        columns = {
-            "observations": data.states,
-            "actions": actions,
-            "rewards": data.rewards,
-            "terminals": data.terminated,
-            "timeouts": data.ends & ~data.terminated,
-            "next_observations": data.next_states,
-            "about": np.array(about),
-            **({} if spec is None else {TASK: np.array(spec.id)}),
-        }
-        with replacing(target) as file:
-            np.savez(file, **columns)
-        return
+        _write_npz(data, target, env, about)
+    else:
+        _write_minari(data, os.fspath(target), env, about, algorithm)
+
+
+def _write_npz(data: Dataset, path: str | os.PathLike[str], env: gym.Env[Any, Any], about: str) -> None:
+    """Write D4RL's columns and the task's id."""
+    _, action_space, _ = check_spaces(env.observation_space, env.action_space)
+    spec = env.unwrapped.spec
+    columns = {
+        "observations": data.states,
+        "actions": unscale_action(data.actions, action_space),
+        "rewards": data.rewards,
+        "terminals": data.terminated,
+        "timeouts": data.ends & ~data.terminated,
+        "next_observations": data.next_states,
+        "about": np.array(about),
+        **({} if spec is None else {TASK: np.array(spec.id)}),
+    }
+    with replacing(path) as file:
+        np.savez(file, **columns)
+
+
+def _write_minari(data: Dataset, name: str, env: gym.Env[Any, Any], about: str, algorithm: str) -> None:
+    """Write episodes, the task as it can be made again, and its reference returns where they are known."""
     import minari
     from minari.data_collector import EpisodeBuffer
 
-    stops = np.flatnonzero(data.ends) + 1
-    if spec is not None:  # what was registered, with the arguments that were given; its own lacks the time limit
-        spec, kwargs = copy.deepcopy(gym.spec(spec.id)), spec.kwargs
-        spec.kwargs = {**spec.kwargs, **kwargs}
-        spec.max_episode_steps = (env.spec or spec).max_episode_steps
-    told = None if spec is None else _without_code(spec, os.fspath(target))
+    state_space, action_space, _ = check_spaces(env.observation_space, env.action_space)
+    actions, spec = unscale_action(data.actions, action_space), env.unwrapped.spec
+    registration = _registration_of(env, name)
     reference = reference_returns(spec.id) if spec is not None else None
     scores = {} if reference is None else {"ref_min_score": reference[0], "ref_max_score": reference[1]}
     buffers = []
-    for i, (stop, length) in enumerate(zip(stops, data.lengths, strict=True)):
+    for i, (stop, length) in enumerate(zip(np.flatnonzero(data.ends) + 1, data.lengths, strict=True)):
         steps = slice(stop - length, stop)
         buffers.append(
             EpisodeBuffer(
@@ -120,12 +113,35 @@ def write_dataset(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # that nobody is named as its author, nor a link to its code
         minari.create_dataset_from_buffers(
-            os.fspath(target),
+            name,
             buffers,
-            env=told,
+            env=registration,
             algorithm_name=algorithm,
             description=about,
             observation_space=state_space,
             action_space=env.action_space,
             **scores,
         )
+
+
+def _registration_of(env: gym.Env[Any, Any], target: str) -> EnvSpec | None:
+    """Return how a task is made again: what was registered, with its own arguments and time limit.
+
+    A file holds code by its name. Where code has none, warn, and return None.
+    """
+    own = env.unwrapped.spec
+    if own is None:
+        return None
+    spec = copy.deepcopy(gym.spec(own.id))
+    spec.kwargs = {**spec.kwargs, **own.kwargs}
+    spec.max_episode_steps = (env.spec or spec).max_episode_steps  # the task's own spec lacks it
+    code = spec.entry_point
+    name = getattr(code, "__qualname__", "")
+    if name.isidentifier():  # so no lambda, and not inside of something
+        spec.entry_point = f"{code.__module__}:{name}"
+    try:
+        spec.to_json()
+    except (ValueError, TypeError) as error:
+        warnings.warn(f"{target} will not say its task: {error}", stacklevel=4)
+        return None
+    return spec

@@ -37,9 +37,10 @@ from sb3_said.delays.space import (
     written_ages,
 )
 from sb3_said.delays.wrapper import DelayedObservationWrapper
-from sb3_said.files.agents import SafeSaveMixin, agent_state, existing, with_suffix
-from sb3_said.files.archive import load_tree, readable, save_tree
+from sb3_said.files.agents import SafeSaveMixin
+from sb3_said.files.archive import existing, load_tree, readable, save_tree, with_suffix
 from sb3_said.files.checks import RANGES, check_argument, declared
+from sb3_said.files.state import agent_state
 from sb3_said.replay.buffer import DelayedReplayBuffer, rows_for_logs
 from sb3_said.sac.policies import SERVED, DelayedSACPolicy, as_array
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,56 @@ from sb3_said.delays.space import KEYS, check_spaces, holds_whole_numbers
 from sb3_said.files.atomic import replacing
 from sb3_said.files.normalization import get_statistics
 from sb3_said.said.said import SAID
+from sb3_said.said.student import Student
 
 OPSET, IR_VERSION = 17, 8  # of 2022, so that old runtimes read it
+
+
+class Graph:
+    """An ONNX graph under construction: its nodes in order, and its constants.
+
+    :raises ImportError: without the package onnx
+    """
+
+    def __init__(self) -> None:
+        try:
+            import onnx
+        except ImportError as error:
+            raise ImportError('onnx is missing, which export needs: pip install "sb3_said[export]"') from error
+        self.onnx = onnx
+        self.nodes: list[Any] = []
+        self.constants: list[Any] = []
+
+    def constant(self, value: Any, dtype: Any = np.float32) -> str:
+        """Add a constant and return its name."""
+        name = f"constant_{len(self.constants)}"
+        self.constants.append(self.onnx.numpy_helper.from_array(np.asarray(value, dtype), name))
+        return name
+
+    def add(self, kind: str, *inputs: str, output: str | None = None, **attributes: Any) -> str:
+        """Add a node of one output and return that output's name."""
+        name = output or f"{kind}_{len(self.nodes)}"
+        self.nodes.append(self.onnx.helper.make_node(kind, list(inputs), [name], **attributes))
+        return name
+
+    def clip(self, x: str, low: Any, high: Any) -> str:
+        """Add nodes that hold ``x`` between two constants."""
+        return self.add("Max", self.add("Min", x, self.constant(high)), self.constant(low))
+
+    def model(self, name: str, inputs: dict[str, list[str | int]], outputs: dict[str, list[str | int]]) -> Any:
+        """Return what was added as a checked ``onnx.ModelProto``, whose inputs and outputs are float32.
+
+        :param inputs: shape of each input by its name; a text is an axis of any length
+        """
+        helper = self.onnx.helper
+        tensors = (
+            [helper.make_tensor_value_info(key, self.onnx.TensorProto.FLOAT, shape) for key, shape in part.items()]
+            for part in (inputs, outputs)
+        )
+        graph = helper.make_graph(self.nodes, name, *tensors, self.constants)
+        made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
+        self.onnx.checker.check_model(made)
+        return made
 
 
 def to_onnx(model: SAID, normalization: VecNormalize | None = None) -> Any:
@@ -32,12 +79,7 @@ def to_onnx(model: SAID, normalization: VecNormalize | None = None) -> Any:
     :raises ImportError: without the package onnx
     :raises ValueError: for an agent without a student
     """
-    try:
-        import onnx
-        from onnx import TensorProto, helper, numpy_helper
-    except ImportError as error:
-        raise ImportError('onnx is missing, which export needs: pip install "sb3_said[export]"') from error
-    policy, student = model.policy, model.policy.student
+    graph, policy, student = Graph(), model.policy, model.policy.student
     if "student" not in policy.answers:
         raise ValueError(
             "This agent has no student to export. In Python: model = SAID.load(file, env=env); model.distill(); "
@@ -45,62 +87,61 @@ def to_onnx(model: SAID, normalization: VecNormalize | None = None) -> Any:
         )
     assert student is not None  # who answers is there
     state_space, space, max_delay = check_spaces(policy.observation_space, policy.action_space)
-    obs_dim, act_dim = state_space.shape[0], space.shape[0]
-    nodes: list[Any] = []
-    constants: list[Any] = []
+    scale = normalization or model.get_vec_normalize_env()
+    statistics = get_statistics(scale).get("obs/observation")
 
-    def constant(value: Any, dtype: Any = np.float32) -> str:
-        name = f"constant_{len(constants)}"
-        constants.append(numpy_helper.from_array(np.asarray(value, dtype), name))
-        return name
-
-    def add(kind: str, inputs: Sequence[str], **attributes: Any) -> str:
-        name = f"{kind}_{len(nodes)}"
-        nodes.append(helper.make_node(kind, list(inputs), [name], **attributes))
-        return name
-
-    read, scale = "observation", normalization or model.get_vec_normalize_env()
-    seen = get_statistics(scale).get("obs/observation")
-    if scale is not None and seen is not None:
-        mean, var, _ = seen
-        read = add("Div", [add("Sub", [read, constant(mean)]), constant(np.sqrt(var + scale.epsilon))])
-        read = add("Max", [add("Min", [read, constant(scale.clip_obs)]), constant(-scale.clip_obs)])
+    x = "observation"
+    if scale is not None and statistics is not None:
+        mean, var, _ = statistics
+        z = graph.add("Sub", x, graph.constant(mean))
+        z = graph.add("Div", z, graph.constant(np.sqrt(var + scale.epsilon)))
+        x = graph.clip(z, -scale.clip_obs, scale.clip_obs)
     if student.reader is not None:
-        steps_ago = constant(np.arange(max_delay, 0, -1))  # (D,)
-        since = add("Cast", [add("LessOrEqual", [steps_ago, "delay"])], to=TensorProto.FLOAT)  # (B, D)
-        history = add("Mul", ["action_history", add("Unsqueeze", [since, constant([2], np.int64)])])
-        flat = add("Flatten", [history], axis=1)  # also where D is 0, of which a Reshape could not tell B
-        age = add("Div", ["delay", constant(max(max_delay, 1))])
-        read = add("Concat", [read, flat, age], axis=1)
-    x = add("Div", [add("Sub", [read, constant(student.mean.cpu())]), constant(student.std.cpu())])
-    for layer in student.network:
-        if isinstance(layer, nn.Linear):
-            weights = [constant(part.detach().cpu()) for part in (layer.weight, layer.bias)]
-            x = add("Gemm", [x, *weights], transB=1)
-        else:
-            x = add({nn.ReLU: "Relu", nn.Tanh: "Tanh"}[type(layer)], [x])
+        x = graph.add("Concat", x, *_read_delay(graph, max_delay), axis=1)
+    x = _answer(graph, student, x)
     low, high = (bound.astype(np.float32) for bound in (space.low, space.high))
-    x = add("Add", [constant(low), add("Mul", [constant(0.5 * (high - low)), add("Add", [x, constant(1.0)])])])
-    x = add("Round", [x]) if holds_whole_numbers(space) else x
-    x = add("Max", [add("Min", [x, constant(high)]), constant(low)])
-    nodes.append(helper.make_node("Identity", [x], ["action"]))
+    x = graph.add("Mul", graph.constant(0.5 * (high - low)), graph.add("Add", x, graph.constant(1.0)))
+    x = graph.add("Add", graph.constant(low), x)
+    x = graph.add("Round", x) if holds_whole_numbers(space) else x
+    graph.add("Identity", graph.clip(x, low, high), output="action")
 
-    shapes: dict[str, list[str | int | None]] = {
+    obs_dim, act_dim = state_space.shape[0], space.shape[0]
+    shapes: dict[str, list[str | int]] = {
         "observation": ["B", obs_dim],
         "action_history": ["B", max_delay, act_dim],
         "delay": ["B", 1],
     }
-    given = KEYS if student.reader is not None else KEYS[:1]
-    inputs = [helper.make_tensor_value_info(key, TensorProto.FLOAT, shapes[key]) for key in given]
-    outputs = [helper.make_tensor_value_info("action", TensorProto.FLOAT, ["B", act_dim])]
-    graph = helper.make_graph(nodes, "student", inputs, outputs, constants)
-    made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
+    inputs = {key: shapes[key] for key in (KEYS if student.reader is not None else KEYS[:1])}
+    made = graph.model("student", inputs, {"action": ["B", act_dim]})
     bounds = {"action_low": json.dumps(space.low.tolist()), "action_high": json.dumps(space.high.tolist())}
     bounds["action_dtype"] = str(space.dtype)
-    told = {"max_delay": str(max_delay), "reads_normalized": json.dumps(model.reads_normalized and seen is None)}
-    helper.set_model_props(made, told | bounds)
-    onnx.checker.check_model(made)
+    told = {"max_delay": str(max_delay), "reads_normalized": json.dumps(model.reads_normalized and statistics is None)}
+    graph.onnx.helper.set_model_props(made, told | bounds)
     return made
+
+
+def _read_delay(graph: Graph, max_delay: int) -> tuple[str, str]:
+    """Add what reads history and delay: (B, D * act_dim), zero before the observation, and the delay's part of D."""
+    steps_ago = graph.constant(np.arange(max_delay, 0, -1))  # (D,)
+    since = graph.add("LessOrEqual", steps_ago, "delay")  # (B, D)
+    since = graph.add("Cast", since, to=graph.onnx.TensorProto.FLOAT)
+    since = graph.add("Unsqueeze", since, graph.constant([2], np.int64))
+    history = graph.add("Mul", "action_history", since)
+    flat = graph.add("Flatten", history, axis=1)  # also where D is 0, of which a Reshape could not tell B
+    return flat, graph.add("Div", "delay", graph.constant(max(max_delay, 1)))
+
+
+def _answer(graph: Graph, student: Student, x: str) -> str:
+    """Add a student's network: from what it reads to actions in [-1, 1], (B, act_dim)."""
+    x = graph.add("Sub", x, graph.constant(student.mean.cpu()))
+    x = graph.add("Div", x, graph.constant(student.std.cpu()))
+    for layer in student.network:
+        if isinstance(layer, nn.Linear):
+            weights = [graph.constant(part.detach().cpu()) for part in (layer.weight, layer.bias)]
+            x = graph.add("Gemm", x, *weights, transB=1)
+        else:
+            x = graph.add({nn.ReLU: "Relu", nn.Tanh: "Tanh"}[type(layer)], x)
+    return x
 
 
 def export(model: SAID, path: str | os.PathLike[str], normalization: VecNormalize | None = None) -> None:

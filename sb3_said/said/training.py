@@ -12,7 +12,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from tqdm.auto import tqdm
 
 from sb3_said.files.archive import load_tree, readable
-from sb3_said.files.checkpoint import CheckpointClock, checksum, evaluations_of, restore_evaluations
+from sb3_said.files.checkpoint import CheckpointClock, checksum
+from sb3_said.files.evaluations import evaluations_of, restore_evaluations
 from sb3_said.offline.iql import IQL
 from sb3_said.planner.checks import check_same
 from sb3_said.planner.config import PlannerConfig

@@ -132,21 +132,7 @@ def load_run(
     """
     file, record = find_agent(Path(path))
     hyperparams = record.hyperparams if record is not None else {}
-    own_algo, own_task = described(file) if record is None else (record.algo, record.env)
-    unknown = [name for name in (own_algo or algo, algo or own_algo) if name not in ALGORITHMS]
-    if unknown:  # an agent of SB3 itself would run code of its file
-        names = ", ".join(ALGORITHMS)
-        told = f" ({unknown[0]})" if unknown[0] else ""
-        raise ValueError(
-            f"The algorithm of {file} is not known{told}: give --algo, one of {names}. What Stable-Baselines3 itself "
-            "has saved, sb3-said collect alone opens."
-        )
-    if own_algo and algo not in (None, own_algo):
-        warnings.warn(f"{file} is of {own_algo!r}, as it says itself: --algo {algo} changes nothing.", stacklevel=2)
-    algo, env_id = str(own_algo or algo), env_id or own_task
-    if env_id is None:
-        raise ValueError(f"The task of {file} is not known: no run folder is around it, and it names none. Give --env.")
-
+    algo, env_id = _algorithm_and_task(file, record, algo, env_id)
     if record is not None:
         record.require("env_wrapper", "env_kwargs")
     import_packages([*(record.gym_packages if record is not None else ()), *gym_packages])
@@ -162,7 +148,7 @@ def load_run(
             raise ValueError(f"{env_id} cannot be made with {kwargs}: {error}") from error
 
     task, wrappers = make_task(), record.wrappers if record is not None else []
-    own_delay = _process_of(task)  # a task may be registered with one
+    own_delay = _process_of(task)
     if own_delay is None:
         wrappers = wrappers if delay is None and record is not None else _with_delay(wrappers, delay, model)
     elif delay is not None and make_process(delay) != own_delay:
@@ -188,6 +174,28 @@ def load_run(
     statistics = find_normalization(file, record)
     normalize = _load_normalize(file, statistics, make_env, is_normalized)
     return LoadedRun(model, make_env, normalize, file.parent, info, changes(kwargs, wrappers), statistics, own_delay)
+
+
+def _algorithm_and_task(file: Path, record: Record | None, algo: str | None, env_id: str | None) -> tuple[str, str]:
+    """Return the algorithm and the task of an agent: what its run or its file says, and what is given where they don't.
+
+    :raises ValueError: where nobody says it
+    """
+    own_algo, own_task = described(file) if record is None else (record.algo, record.env)
+    unknown = [name for name in (own_algo or algo, algo or own_algo) if name not in ALGORITHMS]
+    if unknown:  # an agent of SB3 itself would run code of its file
+        names = ", ".join(ALGORITHMS)
+        told = f" ({unknown[0]})" if unknown[0] else ""
+        raise ValueError(
+            f"The algorithm of {file} is not known{told}: give --algo, one of {names}. What Stable-Baselines3 itself "
+            "has saved, sb3-said collect alone opens."
+        )
+    if own_algo and algo not in (None, own_algo):
+        warnings.warn(f"{file} is of {own_algo!r}, as it says itself: --algo {algo} changes nothing.", stacklevel=3)
+    env_id = env_id or own_task
+    if env_id is None:
+        raise ValueError(f"The task of {file} is not known: no run folder is around it, and it names none. Give --env.")
+    return str(own_algo or algo), env_id
 
 
 def _warn_if_unfinished(model: BaseAlgorithm, file: Path, record: Record | None) -> None:

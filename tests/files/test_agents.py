@@ -19,8 +19,8 @@ from stable_baselines3.common.utils import ConstantSchedule, LinearSchedule
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_said import SAID, DelayedSAC
-from sb3_said.files.agents import agent_state, restore_agent
 from sb3_said.files.archive import SavedFileError, load_metadata, load_tree
+from sb3_said.files.state import agent_state, restore_agent
 from sb3_said.sac.policies import DelayedSACPolicy
 from sb3_said.said.policies import SAIDPolicy
 

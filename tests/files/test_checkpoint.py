@@ -28,11 +28,10 @@ from sb3_said.files.checkpoint import (
     CHECKPOINT_NAME,
     TrainingCheckpointCallback,
     checksum,
-    random_state,
-    restore_random_state,
     restore_training,
     training_state,
 )
+from sb3_said.files.random_states import random_state, restore_random_state
 
 PLANNER = {"d_model": 32, "depth": 1, "horizon": 3, "batch_size": 16, "sampling_steps": 2, "n_candidates": 3}
 
@@ -138,24 +137,6 @@ def test_a_checkpoint_holds_the_whole_run(tmp_path):
     assert (python, numpy, torch) == (random.random(), np.random.rand(), th.rand(1))
 
 
-def test_a_run_on_the_cpu_leaves_a_gpu_alone(monkeypatch):
-    monkeypatch.setattr(th.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(th.cuda, "get_rng_state_all", lambda: pytest.fail("asked of a GPU that the run has not used"))
-    assert "cuda" not in random_state()
-    monkeypatch.setattr(th.cuda, "is_initialized", lambda: True)
-    monkeypatch.setattr(th.cuda, "get_rng_state_all", lambda: ["first"])
-    assert random_state()["cuda"] == ["first"]
-
-
-def test_a_machine_of_fewer_gpus_takes_the_random_states_of_as_many(monkeypatch):
-    taken, state = [], random_state()
-    monkeypatch.setattr(th.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(th.cuda, "device_count", lambda: 1)
-    monkeypatch.setattr(th.cuda, "set_rng_state_all", taken.extend)
-    restore_random_state({**state, "cuda": ["first", "second"]})
-    assert taken == ["first"]
-
-
 def test_a_run_that_was_stopped_at_once_has_no_checkpoint_before_it_is_written(tmp_path):
     callback = TrainingCheckpointCallback(tmp_path, should_stop=lambda: True)
     with pytest.raises(KeyboardInterrupt):
@@ -187,20 +168,6 @@ def test_the_last_states_of_episodes_tell_replays_apart():
     assert checksum(model) == before
     model.replay_buffer._next_states += 1
     assert checksum(model) != before
-
-
-def test_random_states_come_back(tmp_path):
-    random.gauss(0, 1)  # Python keeps a second number for the next call
-    np.random.normal()  # so does NumPy
-    save_tree(tmp_path / "random", random_state())
-
-    def draw():
-        return random.gauss(0, 1), random.random(), np.random.normal(), np.random.rand(), th.rand(3).tolist()
-
-    expected = draw()
-    assert draw() != expected
-    restore_random_state(load_tree(tmp_path / "random"))
-    assert draw() == expected
 
 
 def test_a_resumed_environment_starts_a_new_episode(tmp_path):

@@ -31,7 +31,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_said import SAID, DelayedSAC
 from sb3_said.files.archive import SavedFileError, save_tree
-from sb3_said.files.checkpoint import random_state, restore_random_state, restore_training, training_state
+from sb3_said.files.checkpoint import restore_training, training_state
+from sb3_said.files.random_states import random_state, restore_random_state
 from sb3_said.said.policies import SAIDPolicy
 
 SECONDS, BYTES = 5.0, 2**30
