@@ -69,7 +69,7 @@ class PlannerConfig:
     end_time_probability: float = 0.25
     # Part of the training windows that start early in an episode (log-uniform over its steps). A good agent's replay
     # has one start for a thousand steps, and a planner that falls there never gets to the rest: without, two of three
-    # planners of one replay did (measured, results/what_diffusion_buys.md). 0 is the paper's; in [0, 1]
+    # planners of one replay did (measured, results/planner_lottery.md). 0 is the paper's; in [0, 1]
     early_probability: float = 0.25
     # Which actions a training window shows: those of a delay drawn from 0..max_delay, so that one network serves all;
     # "own": the same, in windows whose decision was made on an observation of that age, where the data know it;
@@ -116,7 +116,7 @@ class PlannerConfig:
     ema_decay: float = 0.9999  # paper
     ema_warmup: bool = True  # without it 37 % of the initial weights remain after 10,000 steps
     # beta in the window weight exp(beta * (value - 1)). Measured: at the paper's 2 a clone of one replay still took its
-    # first steps as the few episodes do that fall there (results/what_diffusion_buys.md)
+    # first steps as the few episodes do that fall there (results/planner_lottery.md)
     weight_factor: float = 4.0
     # What that value is: "centred", from -1 at the lowest value of the data to 1 at the highest (DV; the paper does not
     # say); "range", the same from 0 to 1; or "rank", the part of all windows that are worth less, so that beta picks as

@@ -17,7 +17,7 @@ CLONE_WIDTH = 256
 CLONE_LEARNING_RATE = 1e-3
 GUESS_BATCH_SIZE = 256
 # Of many steps at once: updates of one step for each, the part of their rate (at a quarter an Ant-v5 lost a third of
-# its return, results/what_diffusion_buys.md), and the largest norm of a gradient
+# its return, results/first_guess.md), and the largest norm of a gradient
 ROLLED_EACH, ROLLED_RATE, ROLLED_CLIP = 16, 0.1, 1.0
 
 
@@ -102,7 +102,7 @@ def fit_first_guess(
     """Train the plain networks on single steps, then the model alone on as many at once as it will be rolled out over.
 
     A model that learned single steps has never met its own answers, and fails at old observations first where a policy
-    acts on them (measured, results/what_diffusion_buys.md).
+    acts on them (measured, results/first_guess.md).
 
     :param guess: to train, on the device of the sources
     :param source: windows whose values are those that weigh them
@@ -115,7 +115,7 @@ def fit_first_guess(
     :param should_stop: asked after every update
     :param older: steps that make half of each of the model's batches, and none of the clone's: what policies did ages,
         and how the task moves does not. Where the newest are few, a quarter off the model's errors, and nothing lost
-        where they are many (results/what_diffusion_buys.md)
+        where they are many (results/first_guess.md)
     :return: whether all updates were made
     """
     model, clone = guess.model, guess.clone

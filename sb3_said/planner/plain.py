@@ -98,7 +98,7 @@ class OneStepModel(nn.Module):
     """Predicts the state that follows an action, as a difference from the one before, in units of its usual moves.
 
     Four residual blocks are a quarter nearer than two, and more than that nearer than two plain layers (measured,
-    results/what_diffusion_buys.md, results/nine_logs.md).
+    results/first_guess.md, results/nine_logs.md).
     """
 
     learning_rate = 2e-3  # of Adam, results/nine_logs.md has others
@@ -123,7 +123,7 @@ class OneStepModel(nn.Module):
 
         The model goes on from its own answers, as it is used. Up to constants it is the negative log-likelihood of
         Gaussian errors, each entry with a variance of its own, as the batch has it. A plain mean would be about what
-        cannot be foreseen: 78 of Ant-v5's 105 entries are contact forces (measured, results/what_diffusion_buys.md).
+        cannot be foreseen: 78 of Ant-v5's 105 entries are contact forces (measured, results/first_guess.md).
 
         :param states: (B, K + 1, obs_dim), one after the other
         :param actions: (B, K, act_dim), between them

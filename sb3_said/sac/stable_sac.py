@@ -27,7 +27,7 @@ YOUTH = 4.0  # decays of a young average are 1 - YOUTH / n, so that it is n / 5 
 class StableSAC(DelayedSAC):
     """:class:`DelayedSAC` whose returns rise and stay: what the field has found since SAC, as far as it helps here.
 
-    Five parts, measured in results/stable_expert.md:
+    Five parts, measured in results/expert_parts.md:
 
     - rewards are divided by the size of the returns so far (SimbaV2, https://arxiv.org/abs/2502.15280, section 4.4), so
       that the critics' units stay the same while the policy improves;
@@ -54,7 +54,7 @@ class StableSAC(DelayedSAC):
     :param target_entropy: SAC's; ``"half"`` is -act_dim / 2, ``"auto"`` is -act_dim
     :param critic_layer_norm: a LayerNorm follows each hidden layer of the critics, which bear ``gradient_steps=2`` with
         it (DroQ, https://arxiv.org/abs/2110.02034). HalfCheetah-v5, whose episodes do not end by a fall, learns
-        faster with it; Hopper-v5 does not, and Walker2d-v5 falls for longer (results/stable_expert.md)
+        faster with it; Hopper-v5 does not, and Walker2d-v5 falls for longer (results/expert_parts.md)
     :param sac_kwargs: every other argument of :class:`DelayedSAC`
     :raises ValueError: as ``DelayedSAC`` does, and for a ``policy_delay`` or an ``actor_averaging`` out of range
     :raises TypeError: for an unknown argument

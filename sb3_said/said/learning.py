@@ -58,7 +58,7 @@ class PlannerLearner(PlannerAgent):
             held_out=HELD_OUT if len(source) > 1 else 0.0,
             seed=self.seed or 0,
             older=replay.window_source(newest, env, older=True) if has_older else None,
-            # On HalfCheetah-v5's log many steps at once cost four fifths of the return (results/what_diffusion_buys.md)
+            # On HalfCheetah-v5's log many steps at once cost four fifths of the return (results/first_guess.md)
             guess_steps=1 if replay.holds_logs else max(1, self.policy.max_delay),
         )
 

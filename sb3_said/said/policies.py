@@ -322,7 +322,8 @@ class SAIDPolicy(DelayedSACPolicy):
         """Tell for which observations the expert decides: (B,) bool.
 
         Where both do, the one that decides at the largest age begins: while s_0 is all that has arrived, the age still
-        grows, and a planner that takes over from the expert amid its first steps falls (measured, results/agents.md).
+        grows, and a planner that takes over from the expert amid its first steps falls (measured,
+        results/agents_before.md).
         """
         if who == "both" and isinstance(observation, dict):
             history, age = observation["action_history"], observation["delay"][:, 0].long()  # (B, D, act_dim), (B,)

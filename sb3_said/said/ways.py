@@ -24,7 +24,7 @@ DEFAULT_WAY: dict[str, Any] = {
 #: depends on task, delay and budget (measured, results/what_diffusion_buys.md and results/settings.md). Where the trial
 #: cannot tell, the order does: the first was best or second with each of seven planners. "own_ages" is another planner,
 #: of decisions made at the age that it is shown: where an expert does one thing on new observations and another on old
-#: ones, the first learns the mean of both (results/what_diffusion_buys.md has where that gains, and where it loses).
+#: ones, the first learns the mean of both (results/own_mask.md has where that gains, and where it loses).
 WAYS: dict[str, dict[str, Any]] = {
     "weighed": {"decided_by": "plan", "temperature": 1.0, "sampling_steps": 2, "choice_factor": 1.0},
     "actor": {"decided_by": "actor"},
