@@ -1,7 +1,7 @@
 # make install   the virtual environment .venv, with everything
 # make train     trains SAID on a MuJoCo task under delay, evaluates it beside its expert and draws a plot
 # make report    README's table and picture, from the raw files of results/; with EACH=--each every training seed's table
-# make demo      draws demo.gif: a trained agent under delay, beside itself as if it did not know of it
+# make demo      draws demo.gif: a trained agent under delay, beside the same agent told that every observation is new
 # make test      lint, types and tests: what CI runs
 # make format    rewrites the code as `make lint` wants it
 
@@ -18,7 +18,7 @@ PRESET := quick
 LOGS := logs
 EPISODES := 20
 
-# What README's table is of
+# The agents of README's table
 AGENTS := window_weights/hopper_seed1 window_weights/hopper_seed2 window_weights/hopper_seed3 \
 	window_weights/walker2d_seed1 window_weights/walker2d_seed2 window_weights/walker2d_seed3 \
 	window_weights/halfcheetah_seed1 window_weights/halfcheetah_seed2 window_weights/halfcheetah_seed3 \
@@ -36,9 +36,9 @@ $(VENV)/.installed: setup.cfg pyproject.toml constraints.txt scripts/install_tor
 	$(PY) -m pip install -c constraints.txt -e ".[all]"
 	touch $@
 
-# A training that has ended says where it saves; the newest folder may be of another.
-# Ctrl-C is for the training, which then saves what was learned: tee -i outlives it.
-# One decision is too small for two threads, which wait for each other wherever another process is busy.
+# The run's folder is the one that the training prints when it saves; the newest folder may be another run's.
+# Ctrl-C is for the training, which then saves what it has learned; tee -i goes on until then.
+# One decision is too small for two threads: they wait for each other wherever another process is busy.
 train: install
 	log=$$(mktemp) && \
 	$(PY) -u scripts/train.py --algo $(ALGO) --env $(ENV) --delay $(DELAY) --preset $(PRESET) -f "$(LOGS)" | tee -i $$log; \

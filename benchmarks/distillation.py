@@ -2,10 +2,10 @@
 
     python benchmarks/distillation.py RUN --seeds 1 2 --delays 0 4 8 16 --json distillation.json
 
-RUN is the folder of a SAID run that has ended, with its checkpoint, which holds the replay, or any SAID agent with a
-log of the task in the replay's place (--log, such as scripts/collect.py makes). Each student learns from the planner at
-temperature 0, as model.distill() does by itself. "kept" is its mean return over the planner's, all
-delays together. Times are of single answers on one thread: of predict(), and of the exported graph (--onnx).
+RUN is the folder of a SAID run that has ended; its checkpoint holds the replay. With --log, RUN is any SAID agent, and
+a log of its task (such as scripts/collect.py makes) takes the place of the replay. Each student learns from the planner
+at temperature 0, as in any model.distill(). "kept" is the student's mean return over the planner's, all delays
+together. Times are of single answers on one thread: of predict(), and of the exported graph (--onnx).
 A call plays what --json lacks, so the same command goes on after a stop.
 """
 
@@ -31,7 +31,7 @@ from sb3_said.said.export import export
 
 
 def play(model: SAID, args: argparse.Namespace) -> dict[str, Any]:
-    """Return an agent's returns by delay, and the time of its answers at the longest."""
+    """Return an agent's returns by delay, and the time of its answers at the longest delay."""
     found: dict[str, Any] = {"returns": {}}
     for delay in args.delays:
         progress(f"the {model.policy.who_answers} plays {args.episodes} episodes at delay {delay}")

@@ -3,9 +3,9 @@
     python benchmarks/expert_updates.py --json results/speed/expert_updates.json
 
 All have SB3's default networks and batch (Hopper-v5) and a replay buffer of their own; sampling is included. StableSAC
-updates its actor every second time, and keeps an average of it. "time, SAC's = 1" is the median of the ratios turn by
-turn, with its 95 % interval: above 1 is slower than SB3's SAC. "fraction of floor" is the time of the matrix products
-alone over the time of an update. The products are counted from their shapes, at the rate that large products reach on
+updates its actor every second time and keeps an average of its weights. "time, SAC's = 1" is the median of the ratios
+turn by turn, with its 95 % interval: above 1 is slower than SB3's SAC. "fraction of floor" is the time of the matrix
+products alone over the time of an update. That time follows from their shapes and the rate that large products reach on
 this machine and thread count.
 """
 
@@ -39,12 +39,12 @@ def make(cls: type[SAC], delay: int, args: argparse.Namespace) -> SAC:
 def matmul_flops(model: SAC, batch_size: int) -> float:
     """Count the floating-point operations of one update's matrix products, as autograd makes them, on average.
 
-    A product forward takes two operations a weight and row; backward as many for the input's gradient and as many for
-    the weights'. No layer that reads data needs its input's gradient.
+    A forward product takes two operations for each weight and row. Backward there are as many for the gradient of the
+    input, and as many for that of the weights. A layer that reads data needs no gradient of its input.
 
-    The actor runs for the next state, and for this one with a pass back. The critics run for the target, for the fit
-    with a pass back, and for the actor's loss with a pass back to their input; that one reaches their weights, too, but
-    for StableSAC's, which makes it every ``policy_delay`` updates.
+    The actor runs forward for the next state, and forward and back for the current one. The critics run forward for the
+    target, forward and back for the fit, and forward and back for the actor's loss. In this last pass the weights get
+    gradients, too, except in StableSAC, which makes it only every ``policy_delay`` updates.
     """
 
     def weights(net: nn.Module) -> list[int]:

@@ -21,7 +21,7 @@ from sb3_said.evaluation.statistics import FEWEST_RESAMPLED
 from sb3_said.files import atomic as files
 from sb3_said.planner.precision import has_bfloat16
 
-PATIENCE = 2.0  # seconds without a sign of life
+PATIENCE = 2.0  # seconds after which a measurement shows its progress
 DTYPES = {"float32": th.float32, "bfloat16": th.bfloat16}
 
 
@@ -56,11 +56,11 @@ def turn_by_turn(
 ) -> dict[str, np.ndarray]:
     """Time variants in turn, in both orders alternately, so that a drift of the machine meets all of them alike.
 
-    Every variant runs once before, uncounted. What takes longer than ``PATIENCE`` shows on stderr how far it is.
+    Every variant first runs once, uncounted. A measurement longer than ``PATIENCE`` shows its progress on stderr.
 
     :param variants: what to time, by name
     :param rounds: turns of each
-    :param device: waited for before the clock is read
+    :param device: torch device, which must finish before the clock is read
     :return: seconds of each turn by name, (rounds,) each
     """
 
@@ -85,9 +85,9 @@ def turn_by_turn(
 def ratio(slow: np.ndarray, fast: np.ndarray) -> Interval:
     """Return how many times as long ``slow`` takes: the median of the ratios turn by turn, with its interval.
 
-    Of fewer than ten turns that is the range of the ratios, which misses the median only where all are on one side of
-    it: its ``confidence`` is 1 - 2^(1 - rounds), above .95 from six on. A bootstrap or Student's t covers less than
-    it says there.
+    For fewer than ten turns the interval is the range of the ratios. It misses the median only if all ratios are on one
+    side, so its ``confidence`` is 1 - 2^(1 - rounds), above .95 from six turns on. Of so few turns a bootstrap or
+    Student's t covers less than it says.
 
     :param slow: (rounds,) seconds
     :param fast: (rounds,) seconds of the same turns
@@ -103,7 +103,7 @@ def ratio(slow: np.ndarray, fast: np.ndarray) -> Interval:
 def matmul_rate(dtype: str, device: str | th.device = "cpu", size: int | None = None, seconds: float = 1.0) -> float:
     """Return what this machine reaches in large square matrix products, the 95th percentile in FLOP/s.
 
-    :param dtype: ``"float32"`` or ``"bfloat16"``; emulated, without :func:`has_bfloat16`, it can take minutes
+    :param dtype: ``"float32"`` or ``"bfloat16"``, which is emulated without :func:`has_bfloat16` and can take minutes
     :param device: to measure
     :param size: rows and columns; by default 2048, on a GPU 8192
     :param seconds: to measure for, at least
@@ -155,9 +155,9 @@ def write_json(path: Path | None, args: argparse.Namespace, rows: Sequence[Mappi
 def resumed(p: argparse.ArgumentParser, path: Path, settings: dict[str, Any], **empty: Any) -> dict[str, Any]:
     """Return what a file of ``--json`` holds, or a document with nothing in it yet.
 
-    The program ends where the file has other settings.
+    The program ends if the file has other settings.
 
-    :param p: tells the error
+    :param p: reports the error
     :param empty: parts of a new document
     """
     document: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {"settings": settings, **empty}

@@ -3,18 +3,18 @@
     python benchmarks/motivation.py --env Hopper-v5 --dataset medium.npz --json motivation.json --plot motivation.png
     python benchmarks/motivation.py ... --actor logs/sadr/Hopper-v5-seed1_1    # who acts on the beliefs, in BC's place
 
-Four beliefs of the present learn from the same episodes: "inpainted" is SAID's planner, "guessed" its first guess,
-"rolled out" a network of one step that is rolled out over the actions since, as the guess's is, "regressed" an MLP that
-is asked for the present at once. One network of each serves all delays, and --plain-steps gives the plain ones as many
+Four beliefs of the present learn from the same episodes. "inpainted" is SAID's planner, and "guessed" its first guess.
+"rolled out" is a one-step model that is rolled out over the actions since, as the guess's is. "regressed" is an MLP
+that predicts the present at once. One network of each serves all delays. --plain-steps gives the plain networks as many
 gradient steps as they need.
 
 error   root mean squared error of s_t on held-out episodes, in standard deviations of the states, the same windows for
         all beliefs
 return  of one actor without delay that acts on each belief, over seeded episodes: behaviour cloning of the same
-        episodes at delay 0, or --actor. Beside it "old observation", on which it acts as if nothing was delayed,
-        "SAID", whose planner decides itself, "one step", the same with one step of denoising, "SAID, inpainting", the
-        same as SAID with its present inpainted, "guess alone", the clone of SAID's first guess at the present that it
-        guesses, and "cloning": BC on the augmented state
+        episodes at delay 0, or --actor. For comparison, it acts on the "old observation" as if nothing was delayed.
+        "SAID" decides by its planner; "one step" is SAID in one denoising step, and "SAID, inpainting" is SAID with its
+        present inpainted. "guess alone" is the clone in SAID's first guess, at the present that it guesses. "cloning"
+        is BC on the augmented state
 """
 
 from __future__ import annotations
@@ -80,9 +80,9 @@ class OldObservation:
 
 
 class AllAtOnce:
-    """SAID's answers to a batch at once, in a fraction of the time, with other settings of sampling if any are given.
+    """SAID, answering a batch at once, in a fraction of the time, with other settings of sampling if any are given.
 
-    From those row by row they differ by rounding at temperature 0, and above it by noise that is drawn.
+    Answers row by row differ from these by rounding at temperature 0, and above it by the noise that is drawn.
     """
 
     def __init__(self, said: SAID, **settings: Any):
@@ -110,7 +110,7 @@ class GuessAlone:
 def split(data: Dataset, held_out: float, seed: int) -> tuple[Dataset, Dataset]:
     """Return training and held-out episodes.
 
-    :raises ValueError: when there are not two episodes
+    :raises ValueError: when there are fewer than two episodes
     """
     n = len(data.lengths)
     if n < 2:
@@ -121,7 +121,7 @@ def split(data: Dataset, held_out: float, seed: int) -> tuple[Dataset, Dataset]:
 
 
 def train(data: Dataset, args: argparse.Namespace) -> tuple[dict[str, Belief], Any, SAID, BC]:
-    """Return the beliefs by name, the actor without delay, and who decides under delay by itself."""
+    """Train, and return the beliefs by name, the actor without delay, and the agents that decide under delay."""
     task = gym.make(args.env)
     env = DelayedObservationWrapper(gym.make(args.env), delay=(0, args.max_delay))
     said = SAID(
@@ -131,7 +131,7 @@ def train(data: Dataset, args: argparse.Namespace) -> tuple[dict[str, Belief], A
         seed=args.seed,
         device=args.device,
     )
-    # rows of the log go nowhere; a progress bar shows the updates
+    # The log goes nowhere; a progress bar shows the updates
     said.learn_offline(data, args.gradient_steps, folder=args.folder, progress_bar=True)
     source = data.to_replay(task.observation_space, task.action_space).window_source()
     sizes = source.obs_dim, source.act_dim, args.max_delay
@@ -273,7 +273,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
 
 
 def dict_of(option: str, text: str) -> dict[str, Any]:
-    """Read ``name=value`` pairs, parted by commas; a value is a number or a bool where it can be one.
+    """Read ``name=value`` pairs, separated by commas; a value is a number or a bool where it can be one.
 
     :raises ArgumentTypeError: for anything else
     """

@@ -3,14 +3,14 @@
     python benchmarks/offline_table.py medium=results/offline/hopper-medium-0.json \\
         mixed,DQL+SA=results/nine_logs/hopper-mixed-0-dql.json --plot results/offline
 
-Each file is of motivation.py (its players, of one planner seed), or of sb3-said over-delays (one agent, which is named
-after the comma). Files of one task, set and name are seeds of the same training.
+Each file is from motivation.py (its players, of one planner seed), or from sb3-said over-delays (one agent, whose name
+follows the comma). Files of one task, set and name are seeds of the same training.
 
 plots   95 % intervals are over the episodes of all seeds together
-score   D4RL's normalised score of the mean return; in brackets the seeds' own where there are several
+score   D4RL's normalised score of the mean return; in brackets that of each seed, where there are several
 kept    the return as a part of the same agent's at delay 0
-paper   what Table 2 of arXiv 2603.01553 has for SAID and DQL+SA at these delays, on D4RL's -v2 sets, of which
-        medium-replay stands beside mixed, and medium-expert beside expert: other logs, and other versions of the tasks
+paper   what Table 2 of arXiv 2603.01553 has for SAID and DQL+SA at these delays, on D4RL's -v2 sets: other logs, of
+        other versions of the tasks; medium-replay stands beside mixed, and medium-expert beside expert
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ NAMES = {
     "cloning": "BC",
     "rolled out": "belief-only, rolled-out model",
 }
-#: (set, task) -> rows of Table 2 at delays 0, 4, 8 and 16. DQL+SA has no number at delay 0 but that of their DQL.
+#: (set, task) -> rows of Table 2 at delays 0, 4, 8 and 16. At delay 0, the number of DQL+SA is their DQL's.
 PAPER: dict[tuple[str, str], dict[str, tuple[float, ...]]] = {
     ("expert", "HalfCheetah-v5"): {"SAID": (106.2, 32.8, 4.5, 1.9), "DQL+SA": (95.9, 2.9, 2.1, 1.4)},
     ("mixed", "HalfCheetah-v5"): {"SAID": (50.2, 34.3, 8.3, 2.1), "DQL+SA": (48.9, 0.2, 1.4, 1.3)},
@@ -55,7 +55,7 @@ Seeds = dict[int, list[list[float]]]  # by delay, for each seed its returns
 def read(path: Path, name: str | None) -> tuple[str, dict[str, dict[int, list[float]]]]:
     """Return the task of a file, and its returns by agent and delay.
 
-    :param name: of the agent of a file of over-delays
+    :param name: of the agent in a file of over-delays
     :raises ValueError: for such a file of several agents, or of one that answers in several ways
     """
     document = json.loads(path.read_text())

@@ -5,18 +5,18 @@
 
 Each file is of sb3-said over-delays. Agents of one task, told apart by their file's SHA-256, are training seeds.
 
-SAID       both, each at its ages, where an agent's file shares them between planner and expert; else the planner, or
-           the expert of files after --expert-answers, whose trial found it better
+SAID       planner and expert, each at its ages, where an agent's file has results of both together; else the planner;
+           or the expert, for files after --expert-answers, whose trial found it better
 intervals  95 %, by a bootstrap that draws training seeds, then episodes of each; of one seed over its episodes
 SAID more  SAID's return less its expert's, from the same reset seeds; below it the same with its interval by
            Student's t over training seeds, which is wider for few
-seeds      their own means over fixed delays, in the order of the files
+seeds      mean of each seed over fixed delays, in the order of the files
 falls      part of all episodes that the task ended
 change     of the actions, from step to step
 paper      what Table 1 of arXiv 2603.01553 has for SAID, mean and standard error: an agent for each delay, 5 M steps
 plot       thin lines are training seeds
 
-With --each the table has rows of every training seed by itself.
+With --each, every training seed has rows of its own.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ Seeds = list[dict[int | str, Cell]]  # for each training seed its cell by delay
 def read(paths: Iterable[Path], by_expert: Iterable[Path] = ()) -> dict[str, dict[str, Seeds]]:
     """Return by task and row what each training seed played.
 
-    :param by_expert: files of agents that answer by their expert, whether or not they are among the others
-    :raises ValueError: for files of other episodes, an agent in two files, or one that has no row of SAID
+    :param by_expert: files of agents that answer by their expert, whether or not ``paths`` has them, too
+    :raises ValueError: for files of other episodes, an agent in two files, or one without episodes for a row
     """
     found: dict[str, dict[str, Seeds]] = {}
     episodes: dict[str, dict[str, object]] = {}
@@ -75,13 +75,13 @@ def read(paths: Iterable[Path], by_expert: Iterable[Path] = ()) -> dict[str, dic
 
 
 def returns_over(seeds: Seeds, delays: Sequence[int | str]) -> np.ndarray:
-    """Return each episode's return, in the mean over delays, of the seeds that have played them all: (n_seeds, n)."""
+    """Return each episode's mean return over delays, for the seeds that played them all: (n_seeds, n_episodes)."""
     results = [[of_seed[d].result for d in delays] for of_seed in seeds if set(delays) <= set(of_seed)]
     return np.array([np.mean([result["returns"] for result in of_seed if result], axis=0) for of_seed in results])
 
 
 def gain_over(rows: Mapping[str, Seeds], delays: Sequence[int | str]) -> np.ndarray:
-    """Return what SAID has more than its expert in each episode, as :func:`returns_over`."""
+    """Return how much more SAID earns than its expert in each episode, in the shape of :func:`returns_over`."""
     played = [pair for pair in zip(rows[SAID], rows[EXPERT], strict=True) if set(delays) <= set(pair[0]) & set(pair[1])]
     said, expert = (returns_over([pair[i] for pair in played], delays) for i in range(2))
     return said - expert
@@ -92,11 +92,11 @@ def written(returns: np.ndarray, over_seeds: Callable[[np.ndarray], Interval] = 
     if not len(returns):
         return "-"
     interval = confidence_interval(returns[0]) if len(returns) == 1 else over_seeds(returns)
-    return f"{round(interval.value):,} [{round(interval.low):,}, {round(interval.high):,}]"  # which writes no -0
+    return f"{round(interval.value):,} [{round(interval.low):,}, {round(interval.high):,}]"  # so no -0 is written
 
 
 def show(found: Mapping[str, Mapping[str, Seeds]]) -> None:
-    """Print a Markdown table: SAID, its expert, what SAID has more, and the paper's SAID for each task."""
+    """Print a Markdown table: SAID, its expert, how much more SAID earns, and the paper's SAID, for each task."""
     delays = list(dict.fromkeys(d for rows in found.values() for seeds in rows.values() for one in seeds for d in one))
     fixed, random = ([d for d in delays if isinstance(d, kind)] for kind in (int, str))
     over = {**{str(delay): [delay] for delay in delays}, "mean of fixed": fixed, "mean of random": random}
@@ -105,7 +105,7 @@ def show(found: Mapping[str, Mapping[str, Seeds]]) -> None:
     for env, rows in found.items():
         for row, seeds in rows.items():
             of_fixed, manners = returns_over(seeds, fixed), manners_of(cell for one in seeds for cell in one.values())
-            assert manners is not None  # as `read` has seen to
+            assert manners is not None  # `read` made sure
             cells = {name: written(returns_over(seeds, of)) if of else "-" for name, of in over.items()} | {
                 "seeds": ", ".join(f"{of_seed.mean():,.0f}" for of_seed in of_fixed),
                 "worst tenth": f"{manners.worst_tenth:,.0f}",

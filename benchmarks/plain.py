@@ -7,8 +7,8 @@ It follows CleanDiffuser's DiT pipelines, the code under the paper's results, in
 - an optimizer and an average of the weights that go parameter by parameter;
 - windows fetched one by one, and the loss read after every update.
 
-Shapes and arithmetic of the transformer are ours, so that both ways do the same work. Nothing is slower here than it is
-there. What never touches the result (an unused second network, logs of every denoising step) is left out.
+Shapes and arithmetic of the transformer are ours, so that both ways do the same work. Nothing is slower here than in
+CleanDiffuser. What never touches the result (an unused second network, logs of every denoising step) is left out.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def modulate(x: th.Tensor, shift: th.Tensor, scale: th.Tensor) -> th.Tensor:
 
 
 class DiT(nn.Module):
-    """The noise of a noisy window, one token per time step.
+    """Predicts the noise in a noisy window, one token per time step.
 
     :param in_dim: numbers in a state and an action together
     """
@@ -201,7 +201,7 @@ class PlainPlanner:
     def sample(self, prior: th.Tensor, sampling_steps: int, temperature: float) -> th.Tensor:
         """Return denoised windows by DDIM: (M, L, in_dim).
 
-        :param prior: (M, L, in_dim), what is known in its place
+        :param prior: (M, L, in_dim), with all known entries in place
         """
         times = th.linspace(START_TIME, END_TIME, sampling_steps + 1, device=self.device)
         alphas, sigmas = alpha_sigma(times)
@@ -227,7 +227,7 @@ class PlainPlanner:
     ) -> np.ndarray:
         """Return the action of the best candidate, by the mean of min Q over its scored states: (B, act_dim).
 
-        One candidate is not scored.
+        A single candidate is not scored.
 
         :param observation: (B, obs_dim) delayed observations
         :param action_history: (B, d, act_dim) actions sent since, oldest first

@@ -5,16 +5,16 @@
     python benchmarks/plan_latency.py --num-threads 1 --rounds 10
     python benchmarks/plan_latency.py --depth 4 --sampling-steps 10 --n-candidates 32    # one setting of your own
 
-Hopper-v5's sizes at a delay of 8 steps, so windows of 16. Weights are random: they do not change the time. The rows
-"paper" are ``PlannerConfig.paper()``, float32 as there. With 2 steps the paper says 15 ms, on an A100, and not of what
-depth; 8 is most of its Table 4.
+Sizes are Hopper-v5's at a delay of 8 steps, so windows have 16. Weights are random, which does not change the time.
+The rows "paper" are ``PlannerConfig.paper()``, in float32 as there. For 2 steps the paper says 15 ms, on an A100, but
+tells no depth; 8 is the most frequent in its Table 4.
 
 "ours" is ``model.predict(observation, deterministic=True)``, without a first guess, so that both ways do the same work.
 The percentiles include its first call after ``model.warmup()``. "plain" is benchmarks/plain.py, in float32. Both run in
-turn, and "times as fast" is the median of the ratios turn by turn with its 95 % interval. "with a first guess" runs in
-the same turns: how many times as long as "ours" an answer takes then, as it is by default. "of the floor" is the time
-of the matrix products alone over our time. The products are counted from their shapes, at the rate that large products
-of the same number format reach on this machine.
+turn, and "times as fast" is the median of the ratios turn by turn with its 95 % interval. "with a first guess" tells
+how many times as long as "ours" an answer takes with the default's first guess, in the same turns. "of the floor" is
+the time of the matrix products alone over our time. That time follows from their shapes and the rate that large
+products of the same number format reach on this machine.
 
 A second table shows that cost is linear in candidates, denoising steps and environments: a line is fitted to the
 medians. "batched" means all environments in one ``predict(..., deterministic=False)``. Deterministic answers are made
@@ -46,7 +46,7 @@ N_CRITICS = 2
 
 
 class Setting(NamedTuple):
-    """What a decision is made with, at a delay that is the largest one, too."""
+    """The settings of a decision, at a delay that is also the largest."""
 
     name: str
     config: PlannerConfig
@@ -60,12 +60,12 @@ class Setting(NamedTuple):
 
     @property
     def n_candidates(self) -> int:
-        """Windows that are denoised; at temperature 0 all would be the same, so one is."""
+        """Windows that are denoised: one at temperature 0, where all would be the same."""
         return self.config.n_candidates if self.config.temperature > 0 else 1
 
     @property
     def scored(self) -> slice:
-        """The states of a window that the critics score; one candidate is not scored."""
+        """The states of a window that the critics score; a single candidate is not scored."""
         first = {"all": 1, "future": self.delay + 1, "decision": self.delay}[self.config.scored_states]
         return slice(first, first + 1 if self.config.scored_states == "decision" else self.length)
 
@@ -88,18 +88,18 @@ def make_agent(setting: Setting, device: str) -> SAID:
     planner = setting.config.to_dict()
     model = SAID("MultiInputPolicy", env, seed=0, buffer_size=1_000, device=device, planner_kwargs=planner)
     for layer in (model.policy.planner.network.modulation, model.policy.planner.network.out):
-        th.nn.init.normal_(layer.weight, std=0.02)  # zero before training, so that nothing would be computed
+        th.nn.init.normal_(layer.weight, std=0.02)  # all 0 before training, so that the network would compute nothing
     model.policy.planner_updates.fill_(1)
     return model
 
 
 def with_first_guess(setting: Setting) -> Setting:
-    """Return the setting with the default's first guess, and its present too where the planner knows age 0."""
+    """Return the setting with the default's first guess and, where the planner knows age 0, the default's present."""
     return setting._replace(config=replace(setting.config, first_guess="prior", present=None))
 
 
 def make_plain(setting: Setting, device: str, env: gym.Env[Any, Any]) -> Any:
-    """Return the plain planner's decision, with SB3's critics: maps observations to actions."""
+    """Return a function from an observation to the plain planner's action, with SB3's critics."""
     obs_dim, act_dim = sizes(env)
     config = setting.config
     planner = PlainPlanner(obs_dim, act_dim, setting.delay, setting.length, config.d_model, config.depth, device=device)
@@ -126,7 +126,7 @@ def sizes(env: gym.Env[Any, Any]) -> tuple[int, int]:
 
 
 def observe(env: gym.Env[Any, Any], delay: int) -> dict[str, np.ndarray]:
-    """Return an observation amid an episode, where its age is the full delay."""
+    """Return an observation amid an episode, whose age is the full delay."""
     env.action_space.seed(0)
     obs, _ = env.reset(seed=0)
     for _ in range(delay):
@@ -135,9 +135,9 @@ def observe(env: gym.Env[Any, Any], delay: int) -> dict[str, np.ndarray]:
 
 
 def matmul_flops(setting: Setting, obs_dim: int, act_dim: int) -> int:
-    """Count the floating-point operations of one decision's matrix products, two a weight and row.
+    """Count the floating-point operations of one decision's matrix products, two for each weight and row.
 
-    What is computed once for all candidates is left out: it embeds the times and the known part.
+    What is computed once for all candidates is left out: the embeddings of the times and of the known part.
     """
     d, n, length = setting.config.d_model, setting.n_candidates, setting.length
     weights = d * (3 * d + d + 4 * d + 4 * d)  # query, key and value; output of the attention; MLP
@@ -195,7 +195,7 @@ def measure_setting(setting: Setting, rounds: int, device: str, rates: dict[str,
 
 
 def measure_scaling(base: Setting, rounds: int, device: str) -> list[dict[str, Any]]:
-    """Time decisions of several sizes in turn, and return a row for each kind of size with its line."""
+    """Time decisions of several sizes in turn, and return a row with a fitted line for each kind of size."""
     model = make_agent(base, device)
     obs = observe(model.get_env().envs[0], base.delay)  # type: ignore[union-attr]
 

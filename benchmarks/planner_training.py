@@ -5,13 +5,13 @@
     python benchmarks/planner_training.py --device cuda --rounds 200
 
 Every row makes whole updates, from drawing the windows to the averaged weights, on made-up episodes of Hopper-v5's
-sizes. Ours train the regression yardstick, too, and have no first guess, so that both ways do the same work; there is a
-row in bfloat16 where the device multiplies it in hardware. "plain" is benchmarks/plain.py: eager float32, a DataLoader,
-and an optimizer and an average that go parameter by parameter. "times plain" is the median of the ratios turn by turn,
-with its 95 % interval: above 1 is faster than plain.
-"floor" is the time of the transformer's matrix products alone, counted from their shapes, at the rate that large
-products of the same number format reach on this machine and thread count; "fraction of floor" is that over the median
-time of an update.
+sizes. Ours also train the regression yardstick. Otherwise both ways do the same work, since ours have no first guess.
+There is a row in bfloat16 where the device multiplies it in hardware. "plain" is benchmarks/plain.py: eager float32, a
+DataLoader, and an optimizer and an average that go parameter by parameter. "times plain" is the median of the ratios
+turn by turn, with its 95 % interval: above 1 is faster than plain.
+"floor" is the time of the transformer's matrix products alone. It follows from their shapes and the rate that large
+products of the same number format reach on this machine and thread count. "fraction of floor" is the floor over the
+median time of an update.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def make_source(n_episodes: int = 50, length: int = 400) -> WindowSource:
 def matmul_flops(batch_size: int, window: int, d_model: int, depth: int, delay: int) -> int:
     """Count the floating-point operations of the matrix products in one update of the transformer.
 
-    Two operations a weight and row forward, and twice as many backward.
+    Forward there are two operations for each weight and row, backward twice as many.
 
     :param window: L, tokens of a window
     :param delay: D, known actions whose embedding every token gets

@@ -6,7 +6,7 @@
 Random episodes of a delayed task of Ant-v5's sizes go into both buffers, which then return the same: delayed
 observation, action history, age and true state, before and after the step. "GB / 1 M" counts the arrays of a full
 buffer, scaled to a million transitions. "RSS / 1 M" is the growth of the process while a buffer was filled, scaled
-alike (Linux; rough, since it holds all else that was allocated meanwhile). Sampling is timed turn by turn, on one
+alike (Linux; rough, since all else that was allocated meanwhile counts). Sampling is timed turn by turn, on one
 thread. "times SB3" is the median of the ratios of the rates, with its 95 % interval: above 1 is faster than SB3's.
 """
 
@@ -34,7 +34,7 @@ SAMPLES_PER_TURN = 20
 
 
 class RandomTask(gym.Env[np.ndarray, np.ndarray]):
-    """Random observations, to have sizes without a simulator."""
+    """Gives random observations of any size, without a simulator."""
 
     def __init__(self, obs_dim: int, act_dim: int) -> None:
         self.observation_space = spaces.Box(-np.inf, np.inf, (obs_dim,), np.float32)
@@ -61,7 +61,7 @@ def make_buffer(cls: type[ReplayBuffer], env: gym.Env, rows: int) -> ReplayBuffe
 
 def fill(buffer: ReplayBuffer, env: gym.Env, seed: int = 0) -> None:
     """Play random episodes until the buffer is full; the same with the same seed."""
-    keys = set(buffer.observation_space.spaces)  # a dict, of either buffer
+    keys = set(buffer.observation_space.spaces)  # either buffer has a Dict space
     env.action_space.seed(seed)
     obs, info = env.reset(seed=seed)
     for step in range(1, buffer.buffer_size + 1):

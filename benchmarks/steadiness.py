@@ -3,13 +3,13 @@
     python benchmarks/steadiness.py stable=logs/said/Hopper-v5-delay0-16-seed1_1 stable=...seed2_1 sadr=logs/sadr/... \\
         --json steadiness.json
 
-Runs of one name are seeds of the same training: folders, or files written by --json, whose runs of that name count
-(without a name all, each by its own). Of a SAID run its expert's evaluations are read. A training that has not ended
-counts up to where it is.
+Runs of one name are seeds of the same training. A path is a run's folder, or a file written by --json, whose runs of
+that name count (without a name all, each under its own). Of a SAID run the expert's evaluations are read. A training
+that has not ended counts as far as it has come.
 
 mean        of all evaluations in the last steps, over runs
 sd / mean   standard deviation between the evaluations of one run, over their mean; the worst run's
-bad         evaluations below 70 % of their run's median (further below it than 30 % of its size)
+bad         evaluations below 70 % of their run's median (below it by more than 30 % of its absolute value)
 worst run   its mean over the mean of all runs
 """
 
@@ -44,7 +44,7 @@ def read_runs(name: str, path: Path) -> list[dict[str, Any]]:
     files = [file for file in (path / EVALUATIONS, path / "expert" / EVALUATIONS) if file.is_file()]
     if not files:
         raise ValueError(f"{path} has no {EVALUATIONS}; train with --eval-freq.")
-    with np.load(files[-1]) as saved:  # a SAID run's expert has its own
+    with np.load(files[-1]) as saved:  # a SAID run's expert has evaluations of its own
         steps, returns = saved["timesteps"].tolist(), saved["results"].round(1).tolist()
     return [{"name": name, "run": path.name, "steps": steps, "returns": returns}]
 
@@ -52,7 +52,7 @@ def read_runs(name: str, path: Path) -> list[dict[str, Any]]:
 def steadiness(runs: list[dict[str, Any]], last: int) -> dict[str, Any]:
     """Return the columns of a row.
 
-    :param last: environment steps before a run's end from which on its evaluations count
+    :param last: evaluations in so many environment steps before a run's end count
     """
     means = [np.mean(run["returns"], axis=1)[np.array(run["steps"]) > run["steps"][-1] - last] for run in runs]
     of_runs = np.array([late.mean() for late in means])

@@ -1,33 +1,34 @@
-"""What does diffusion buy? Ways to act under delay that learned from one replay, with as many updates each.
+"""What does diffusion buy? Ways to act under delay that learned from one replay, with the same number of updates.
 
     python benchmarks/what_diffusion_buys.py RUN --updates 8000 --seeds 1 2 3 --delays 0 4 8 16 --json rows.json
 
-RUN is the folder of a SAID run with its checkpoint, which holds the replay; a run that has not ended will do. Or it is
-any SAID agent with a log of its task in the replay's place (--log, such as scripts/collect.py makes).
+RUN is the folder of a SAID run, ended or not; its checkpoint holds the replay. With --log, RUN is any SAID agent, and
+a log of its task (such as scripts/collect.py makes) takes the place of the replay.
 
 expert, last         the expert's actor as it is
 expert, average      the average of its weights
 cloning              a plain network from what is known under delay to the action, weighted as the planner is
-regressed present    such a network for the present, and the expert's actor for age 0 on it
-inpainted present    the planner's present, and the same actor
-guessed present      that of its first guess, and the same actor
+regressed present    such a network gives the present, on which the expert's actor acts at age 0
+inpainted present    the planner's present, for the same actor
+guessed present      the present of its first guess, for the same actor
 guess alone          the clone of the first guess, at the present that it guesses
 one step             SAID in one denoising step at temperature 0
 SAID                 SAID as its preset decides: in five steps at temperature 0
-SAID, inpainting     the same, but the planner fills in the present, too, where SAID has its first guess's
+SAID, inpainting     the same, but the planner also fills in the present, which SAID takes from its first guess
 weighed              SAID whose critics weigh the candidates of two steps at temperature 1
 chosen by Q          the best of these candidates by the mean min Q(s, a) of the steps planned after the decision
 chosen by V          the same by V(s), learned on the replay by implicit Q-learning with two steps for each update
 together             the mean of the answers that the seeds' planners give as "SAID"
-paper                SAID with the paper's settings (Tables 3 and 4), but for its averaging, which is warmed up so that
-                     few updates count, and its precision, which is the preset's; seconds a decision on a CPU
+paper                SAID with the paper's settings (Tables 3 and 4), except that the average of its weights is
+                     warmed up, so that few updates count, and that its precision is the preset's; a decision takes
+                     seconds on a CPU
 paper, 2 steps       the same planner in two denoising steps, which the paper has in its appendix, a tenth of the time
 paper, temperature 0 the same planner in five steps and one candidate, as SAID decides
 
-The planner's seed decides its initial weights, its batches and those of the networks. Every row of a seed learns from
-the same batches, but the paper's, which has windows and batches of its own. Planners answer all episodes at once, in a
-fraction of the time. A call plays what --json lacks, so the same command goes on after a stop; the planner of a seed is
-trained anew if one of its rows is missing, and those of all seeds if "together" is.
+The planner's seed decides the initial weights and the batches, also of the networks. Every row of a seed learns from
+the same batches, except the paper's, which has windows and batches of its own. Planners answer all episodes at once, in
+a fraction of the time. A call plays what --json lacks, so the same command goes on after a stop. The planner of a seed
+is trained anew if one of its rows is missing, and the planners of all seeds if "together" is.
 """
 
 from __future__ import annotations
@@ -80,14 +81,14 @@ PAPER = {
     "paper, temperature 0": WAYS["default"],
 }
 ROWS = (*EXPERT, *LEARNED, "together", *PAPER)
-ALONE = (*EXPERT, "together")  # rows that have no planner's seed
+ALONE = (*EXPERT, "together")  # rows without a planner's seed
 
 
 class Regression:
     """The plain network that learns beside a planner: a belief of the present, and a policy by itself.
 
     :param trainer: of the planner
-    :param model: whose actions it gives
+    :param model: the agent, which scales actions
     """
 
     def __init__(self, trainer: PlannerTrainer, model: SAID):
@@ -114,10 +115,10 @@ class Regression:
 
 
 class Together:
-    """Answers with the mean of what several planners answer.
+    """Answers with the mean of several planners' answers.
 
-    :param model: whose planners they are
-    :param planners: that take its place in turn
+    :param model: the agent of these planners
+    :param planners: each takes the place of the agent's planner in turn
     """
 
     def __init__(self, model: SAID, planners: list[InpaintingPlanner]):
@@ -132,7 +133,7 @@ class Together:
 
 
 def open_run(folder: Path, device: str = "cpu") -> SAID:
-    """Return a run's agent with the replay of its checkpoint; of a run that has not ended, the checkpoint's agent.
+    """Return a run's agent with the replay of its checkpoint; if the run has not ended, the checkpoint's agent.
 
     :raises ValueError: for a folder without a checkpoint or a saved SAID agent
     """
@@ -155,7 +156,7 @@ def open_run(folder: Path, device: str = "cpu") -> SAID:
 def open_with_log(agent: Path, log: Path, device: str = "cpu") -> SAID:
     """Return an agent whose replay is a log of its task.
 
-    :raises ValueError: when it is no SAID agent, or the log not of its task
+    :raises ValueError: when it is no SAID agent, or the log is not of its task
     """
     run = load_agent(agent, device)
     if not isinstance(run.model, SAID):
@@ -193,7 +194,7 @@ def learn_values(model: SAID, updates: int) -> None:
     """Learn V(s) on the agent's replay, and let it score plans."""
     model.policy.set_value("iql")
     learner = model._make_value_trainer()
-    assert learner is not None  # as V(s) was just asked for
+    assert learner is not None  # V(s) was just asked for
     for _ in tqdm(range(updates * learner.values.config.updates), desc="V(s)"):
         learner.step()
     assert model.policy.values is not None
@@ -202,14 +203,14 @@ def learn_values(model: SAID, updates: int) -> None:
 
 def preset_of(model: SAID, args: argparse.Namespace) -> PlannerConfig:
     """Return the settings of SAID's row, whatever the run's trial chose."""
-    way = model.planner_ways.get("default", WAYS["default"])  # of the first planner, where the trial took the second
+    way = model.planner_ways.get("default", WAYS["default"])  # the first planner's, even if the trial took another
     return replace(model.policy.planner.config, **{**way, **args.planner_kwargs})
 
 
 def players(model: SAID, rows: list[str], args: argparse.Namespace) -> Iterator[tuple[str, int | None, Any]]:
-    """Yield rows, their seed and who plays them; trains what is missing.
+    """Train what is missing, and yield each row with its seed and its player.
 
-    :param rows: missing ones, as "row/seed"
+    :param rows: those that are missing, as "row/seed"
     """
     policy = model.policy
     if "expert, last/None" in rows:
@@ -312,7 +313,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
 
 
 def show(returns: dict[str, dict[str, list[float]]], args: argparse.Namespace) -> None:
-    """Print a Markdown table: intervals over the planners' seeds, over episodes where there is one agent."""
+    """Print a Markdown table: intervals over the planners' seeds, or over episodes of a single agent."""
     table = []
     for row in args.rows:
         seeds = [None] if row in ALONE else args.seeds

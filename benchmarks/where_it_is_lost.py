@@ -6,7 +6,7 @@ RUN is a SAID agent that learned from the dataset, at delays up to the largest o
 
 SAID                     as it is: if its present is inpainted, present and decision are decoded together
 decoded present, age 0   the planner again, asked without delay on the present that it decoded
-true present, age 0      the same on the true present: what is left is not lost to the delay
+true present, age 0      the same on the true present: what is still lost is not lost to the delay
 true states since        all states up to the present are told (needs a planner with extra_state_probability)
 data, decoded present    the action that the data has at the state nearest to the decoded present
 data, true present       the same at the true present
@@ -15,10 +15,10 @@ actor, true present      the same
 actor, present off by x  the same, with noise of x standard deviations on every entry: what an error of that size costs
 2 held, 4 held           SAID's plan, executed for so many steps before it plans anew
 
-Beside each return stand, over all steps played: the error of the decoded present, and how far the task's state is from
-the nearest of the data's, both as root mean squares over the entries of a state, in standard deviations of the data.
-"data" in the last row of the table is the distance of the data's own states to those of other trajectories. Large
-distances tell that the agent has left what the planner knows; large errors, that it does not know where it is.
+Beside each return stand, over all steps played, the error of the decoded present and the distance of the task's state
+to the nearest state of the data. Both are root mean squares over the entries of a state, in standard deviations of the
+data. The last row, "data", is the distance of the data's own states to those of other trajectories. Large distances
+tell that the agent has left what the planner knows; large errors, that the planner does not know where the task is.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ OFF_BY = (0.05, 0.1, 0.2, 0.4)  # standard deviations of the data
 
 
 class ShowPresents(gym.Wrapper[Any, Any, Any, Any]):
-    """Adds the true states s_{t-D..t}, (D + 1, obs_dim), to the observations; before s_0, s_0."""
+    """Adds the true states s_{t-D..t}, (D + 1, obs_dim), to the observations; s_0 stands for states before it."""
 
     def _add(self, observation: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         return {**observation, PRESENTS: np.array(self.states, np.float32)}
@@ -81,10 +81,10 @@ class Neighbours:
         """Return the distance to the nearest state, root mean square over entries, and its row: (B,) each.
 
         :param states: (B, obs_dim)
-        :param but: (B,) trajectories in which not to look
+        :param but: (B,) a trajectory for each state, which is not searched
         """
         z = states / self.scale
-        squares = self.squares - 2 * z @ self.states.T  # (B, M), less those of z
+        squares = self.squares - 2 * z @ self.states.T  # (B, M), less the squares of z
         if but is not None:
             squares[but[:, None] == self.trajectory] = th.inf
         least, row = squares.min(1)
@@ -147,7 +147,7 @@ class Player:
 
 
 class Held(Player):
-    """Executes so many actions of a plan before it plans anew; all its episodes begin together."""
+    """Executes ``n_held`` actions of a plan before it plans anew; all its episodes begin together."""
 
     def __init__(self, said: SAID, n_held: int, data: Neighbours):
         super().__init__(said, self.next_action, data)
@@ -169,7 +169,7 @@ class Held(Player):
 
 
 def players(said: SAID, data: Neighbours, actor: Any) -> dict[str, Player]:
-    """Return who plays, by name."""
+    """Return the players by name."""
 
     def acts(present: th.Tensor) -> th.Tensor:
         n, parts = len(present), (present.numpy(), np.zeros((len(present), 0, data.actions.shape[1])))

@@ -28,7 +28,7 @@ from std_msgs.msg import Float64MultiArray, String
 from sb3_said import SAID
 from sb3_said.realtime import ControlLoop, ModelProcess
 
-EVERY_SECOND = {"throttle_duration_sec": 1.0}  # at most, of a message
+EVERY_SECOND = {"throttle_duration_sec": 1.0}  # a message is logged at most once a second
 
 
 class ControlNode(Node):
@@ -50,7 +50,7 @@ class ControlNode(Node):
         self.actions = self.create_publisher(Float64MultiArray, self.parameter("action_topic", "/commands"), 1)
         self.heartbeat = self.create_publisher(String, "~/heartbeat", 1)
         self.create_subscription(JointState, self.parameter("observation_topic", "/joint_states"), self.observe, 1)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)  # which nobody sets
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # a clock that nobody sets
         self.create_timer(period, self.act, clock=steady)
         self.create_timer(1.0, self.beat, clock=steady)
 

@@ -1,8 +1,8 @@
-"""Play a robot whose interface is written for rtgym with an agent of sb3_said.
+"""Let an agent of sb3_said control a robot whose interface is written for rtgym.
 
-An interface is a ``RealTimeGymInterface``: ``reset``, ``send_control``, ``get_obs_rew_terminated_info``. What rtgym's
-own environment does with it (the clock, the buffer of actions) is here the control loop's, which also counts how old
-observations are and how long answers take. Copy this file, and call ``play`` with your interface.
+An interface is a ``RealTimeGymInterface``: ``reset``, ``send_control``, ``get_obs_rew_terminated_info``. The control
+loop takes the place of rtgym's own environment (its clock, its buffer of actions). It also counts how old observations
+are and how long answers take. Copy this file, and call ``play`` with your interface.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def play(interface: Any, loop: ControlLoop, n_steps: int) -> float:
     try:
         for k, _ in enumerate(ticks(loop.period)):
             if k > 0:
-                captured = time.monotonic()  # or what the sensor says; before the call, which may take its time
+                captured = time.monotonic()  # before the call, which may take long; or the sensor's own stamp
                 observation, reward, terminated, _ = interface.get_obs_rew_terminated_info()
                 total += reward
                 loop.observe(flat(observation), captured)

@@ -1,7 +1,7 @@
 """A robot on a serial port: python serial_robot.py agent.zip /dev/ttyACM0 0.02
 
-In a control step the robot reads its sensors, sends a line "N x1 x2 ..." of the number of the command that it executed
-in the step before and its state, and executes the newest "N a1 a2 ..." that came. It counts from the port's opening."""
+In each control step the robot reads its sensors and sends a line "N x1 x2 ...": the number of the command executed in
+the step before, and its state. Then it executes the newest "N a1 a2 ..." received. N counts from the port's opening."""
 
 import sys
 import threading
@@ -16,7 +16,7 @@ from sb3_said.realtime import ControlLoop, ModelProcess, ticks
 def listen(port, loop, line=b""):
     while port.is_open:
         try:
-            line += port.readline()  # a part where the robot is silent for a second
+            line += port.readline()  # part of a line if the robot is silent for a second
             if line.endswith(b"\n"):
                 (number, *state), line = line.split(), b""
                 loop.observe([float(x) for x in state], n_executed=int(number))

@@ -25,7 +25,7 @@ __all__ = [
     "PlannerTrainingCallback",
     "StableSAC",
 ]
-_HOMES = ("delays", "planner", "sac", "said")  # of these names, each after those it imports
+_HOMES = ("delays", "planner", "sac", "said")  # where these names live, each folder after those that it imports
 _FOLDERS = (*_HOMES, "replay", "files", "offline", "evaluation", "realtime", "zoo")
 
 

@@ -1,4 +1,4 @@
-"""The delayed world, NumPy only: delay processes, receivers, the wrapper, the scale of actions, the delay of a log."""
+"""The delayed world, NumPy and Gymnasium only: processes, receivers, the wrapper, scaled actions, a log's delay."""
 
 from sb3_said.delays.combined import DroppedPackets, HeldDelay, PeriodicPackets, TotalDelay
 from sb3_said.delays.estimation import DelayEstimate, estimate_delay

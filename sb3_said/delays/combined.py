@@ -21,7 +21,7 @@ from sb3_said.delays.processes import (
 
 
 def _inner(delay: Delay) -> DelayProcess:
-    """Return a process that another one is made of.
+    """Return ``delay`` as a process that another one may contain.
 
     :raises ValueError: for a :class:`TotalDelay` in which every action takes a time of its own
     """
@@ -47,13 +47,13 @@ class _OfProcess(BaseProcess):
 
 @dataclass(frozen=True)
 class HeldDelay(_OfProcess):
-    """A delay that stays for a while: another process, asked anew only at times.
+    """A delay that stays for a while: another process draws a new one only now and then.
 
     ``HeldDelay(UniformDelay(min_lag, max_lag), hold_prob, update_period)`` draws as the delay buffers of Isaac Lab and
     mjlab do (there ``update_period=0`` means every step, and the lag is 0 until the first update).
 
     :param process: draws a new delay when one is due; a process with one delay for an episode draws anew each time
-    :param hold_prob: probability to keep the last delay when a new one is due
+    :param hold_prob: probability of keeping the last delay when a new one is due
     :param update_period: packets from one draw to the next; the phase is drawn at every reset
     :raises ValueError: for a probability outside 0..1 or a period below 1
     """
@@ -80,7 +80,7 @@ class HeldDelay(_OfProcess):
 
 @dataclass(frozen=True)
 class PeriodicPackets(_OfProcess):
-    """A slow sensor: only every ``period``-th control step sends a packet, the first after reset ``period`` steps on.
+    """A slow sensor: after a reset, only every ``period``-th control step sends a packet.
 
     Between packets the age grows: a camera of 10 Hz in a control loop of 50 Hz has ``period=5``.
 
@@ -106,8 +106,8 @@ class PeriodicPackets(_OfProcess):
 class DroppedPackets(_OfProcess):
     """Packets of another process, each lost with probability ``p``.
 
-    Ages are bounded: where losses in a row would make the newest observation older than ``max_delay``, the packet of
-    that age is delivered after all, and counted in ``info["forced_deliveries"]``.
+    Ages are bounded. If losses in a row would make the newest observation older than ``max_delay``, the packet of age
+    ``max_delay`` is delivered after all, and ``info["forced_deliveries"]`` counts it.
 
     :param process: delays of the packets that are not lost
     :param p: probability that a packet is lost
@@ -135,9 +135,9 @@ class DroppedPackets(_OfProcess):
 class TotalDelay(BaseProcess):
     """Observation delay plus action delay: ``delay`` and ``action_delay`` of the wrapper in one, as on a command line.
 
-    An action that takes k steps to the actuator meets the state k steps on. On the actuator's clock, each action is
-    executed as it is chosen, and observations are k steps older. As long as all actions of an episode take equally
-    long, an agent cannot tell which of the two is delayed.
+    An action that takes k steps to the actuator is executed k steps after it was chosen. Counted at the actuator, it is
+    executed at once, and observations are k steps older. As long as all actions of an episode take equally long, an
+    agent cannot tell which of the two is delayed.
 
     :param observation: delays of observations
     :param action: delays of actions
@@ -153,15 +153,15 @@ class TotalDelay(BaseProcess):
 
     @property
     def action_varies(self) -> bool:
-        """Whether every action takes a time of its own, which only the wrapper can act out."""
+        """Whether every action takes a time of its own; only the wrapper can simulate that."""
         return isinstance(as_process(self.action).sample(np.random.default_rng(0)), Iterator)
 
     def sample(self, rng: np.random.Generator) -> int | Iterator[int | None]:
-        """Draw the observation delays from ``rng``, as they are without action delay, the action delay from a child.
+        """Draw the observation delays from ``rng``, as without action delay, and the action delay from a child of it.
 
-        Only where no action takes a time of its own, which the wrapper acts out.
+        This serves action delays that stay for an episode; the wrapper simulates the others.
 
-        :return: one number for the episode where both are
+        :return: one number if both delays stay for the episode, else an iterator
         """
         added = packet_delays(self.action, rng.spawn(1)[0])
         if not isinstance(added, itertools.repeat):

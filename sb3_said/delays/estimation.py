@@ -12,7 +12,7 @@ N_FOLDS = 5  # of the held-out predictions
 MAX_BLOCKS = 100  # a block is a run of rows; it is held out and resampled as a whole
 ROWS_PER_FEATURE = 4  # with fewer, held-out predictions are noise
 MIN_ROWS = 50  # fewer make too few blocks to resample: unrelated data could look certain
-LEAST_SCORE = 2e-3  # where actions follow from the observations, what the ridge leaves of them explains less
+LEAST_SCORE = 2e-3  # actions that the observations determine score less: the ridge leaves little of them
 ROUNDING = 1e-8  # a channel stands still if it moves by less than this part of its size
 
 
@@ -21,12 +21,12 @@ class DelayEstimate:
     """What ``estimate_delay`` found.
 
     :param delay: the age with the highest score, in control steps; the most frequent age where it varies
-    :param confidence: fraction of resampled logs in which the same age has the highest score, and one above 0.002: an
-        age whose action explains nothing is no finding, however often it comes first
+    :param confidence: fraction of resampled logs in which the same age has the highest score, and this is above 0.002.
+        An age whose action explains nothing is no finding, however often it comes first
     :param scores: (max_delay + 1,), a score for each age: the part of the held-out change from one observation to the
         next that the action of that age explains, beyond what earlier observations explain. It is at most 1, and about
-        0 or below for an age that does not occur. Where the delay varies, it is about in proportion to how often each
-        age occurs.
+        0 or below for an age that does not occur. Where the delay varies, the scores are roughly in proportion to how
+        often each age occurs.
     """
 
     delay: int
@@ -44,20 +44,21 @@ def estimate_delay(
 ) -> DelayEstimate:
     """Find how many control steps a logged system's observations are old.
 
-    At age d the action a_{t-d} makes the change from o_t to o_{t+1}. Ridge regression predicts that change, and each of
-    the actions a_t, a_{t-1}, ..., a_{t-max_delay}, from o_t and o_{t-1}. The residual of the right action explains most
-    of the residual of the change (by the rise of R^2, on held-out blocks), and its age is the delay. A channel that
-    echoes the command counts like any other. Rows without a new observation are left out.
+    If observations have age d, the action a_{t-d} causes the change from o_t to o_{t+1}. Ridge regression predicts that
+    change, and each of the actions a_t, a_{t-1}, ..., a_{t-max_delay}, from o_t and the change that brought o_t. The
+    residual of the right action explains most of the residual of the change (measured as the rise of R^2 on held-out
+    blocks); the age of that action is the delay. A channel that echoes the command counts like any other. Rows without
+    a new observation are left out.
 
-    The observations must not determine the actions, as they do in a log of a policy without noise, whose scores are all
-    near 0: log random actions, noise, or a task that keeps moving. Observation
-    and action delay cannot be told apart, so their sum is found. An age equal to ``max_delay`` may stand for a larger
-    one: ask again with a larger ``max_delay``.
+    The observations must not determine the actions. In a log of a policy without noise they do, and all scores are near
+    0: log random actions, noise, or a task that keeps moving. Observation and action delay cannot be told apart, so
+    their sum is found. If the age found is ``max_delay``, the true one may be larger: ask again with a larger
+    ``max_delay``.
 
     :param observations: for each episode (T + 1, obs_dim), as they arrived
     :param actions: for each episode (T, act_dim): action t was sent after observation t had arrived
     :param max_delay: largest age to try, in control steps
-    :param n_resamples: logs to resample for the confidence
+    :param n_resamples: how many resampled logs give the confidence
     :param seed: of the resampling
     :raises ValueError: for arrays that do not fit together or are not finite, observations or actions that never
         change by more than rounding, or too little data
@@ -92,7 +93,7 @@ def estimate_delay(
     of_blocks = np.stack([np.bincount(block, gain) for gain in gains.T], axis=1)  # (n_blocks, max_delay + 1)
     scores = of_blocks.sum(0) / n_rows
     best = int(scores.argmax())
-    if best == max_delay > 0:  # actions that resemble those before them point at it from beyond, with high confidence
+    if best == max_delay > 0:  # if each action resembles the last, a larger delay shows as this one, with confidence
         warnings.warn(
             f"The delay found, {best}, is the largest that was tried, and the true one may be larger: try a larger "
             "max_delay.",
@@ -143,7 +144,7 @@ def _rows(
 def _standardise(x: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Return the columns that vary as z-scores, clipped where a contact or a fall makes them huge: (N, <= dim).
 
-    :param size: (dim,) of the observations, whose rounding is in their changes
+    :param size: (dim,) of the observations; columns that vary by less than their rounding are left out
     """
     if len(x) == 0:
         return x
@@ -152,7 +153,7 @@ def _standardise(x: np.ndarray, size: np.ndarray) -> np.ndarray:
 
 
 def _held_out_gains(x: np.ndarray, y: np.ndarray, lagged: np.ndarray, fold: np.ndarray) -> np.ndarray:
-    """Return by how much each age's action lowers the squared error of the change, mean over channels.
+    """Return by how much each age's action lowers the squared error of the change, averaged over channels.
 
     The change has variance 1, so the mean over rows is the rise of R^2.
 
@@ -175,7 +176,7 @@ def _residuals(x: np.ndarray, targets: list[np.ndarray], kept: np.ndarray) -> li
 
 
 def _check_episodes(observations: Sequence[np.ndarray], actions: Sequence[np.ndarray]) -> None:
-    """Refuse a log whose arrays do not fit together or are not finite with a ``ValueError``."""
+    """:raises ValueError: for a log whose arrays do not fit together or are not finite"""
     if len(observations) != len(actions) or len(actions) == 0:
         raise ValueError(
             "estimate_delay takes one array of observations and one of actions for each episode, at least one, "

@@ -1,4 +1,4 @@
-"""What a model may be asked: observations as the wrapper gives them, checked before they are read."""
+"""The observations that a model accepts: as the wrapper gives them, checked before they are read."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from sb3_said.delays.space import STATE_KEYS
 def checked_observation(
     observation: Any, space: spaces.Space[Any], as_array: Callable[[Any], np.ndarray] = np.asarray
 ) -> tuple[dict[str, np.ndarray], bool]:
-    """Turn observations into float32 arrays of their own memory.
+    """Check observations, and copy them into float32 arrays.
 
     :param observation: one observation or a batch of them, of any numbers
     :param space: that the model was built for: a Box, or the dict of a delayed task
-    :param as_array: makes an array of a part
-    :return: arrays (B, ...) by key, "observation" alone without delay, and whether there was a batch before
+    :param as_array: turns a part of an observation into an array
+    :return: arrays (B, ...) by key, "observation" alone without delay, and whether ``observation`` was a batch
     :raises ValueError: for entries that are no numbers or not finite in float32, another shape, an empty batch,
         other keys, an age outside 0..max_delay, or a ``state_known`` other than 0 and 1
     """
@@ -52,10 +52,10 @@ def checked_observation(
 
 
 def _as_float32(name: str, given: Any, space: spaces.Space[Any], as_array: Callable[[Any], np.ndarray]) -> np.ndarray:
-    """Copy one element of a space, or a batch, to what the networks compute in. The space's bounds are not read.
+    """Copy one element of a space, or a batch, to float32, as the networks read it. The space's bounds are ignored.
 
-    The checks follow the copy: 1e300 is infinite in float32, and noise that an observation decides must not depend on
-    the dtype it came in.
+    The checks follow the copy, since 1e300 is infinite in float32. Noise that is drawn from an observation is then the
+    same for every dtype.
 
     :raises ValueError: for what is no array of real numbers, another shape, an empty batch, or entries not finite
     """

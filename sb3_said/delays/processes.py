@@ -30,7 +30,7 @@ class DelayProcess(Protocol):
         """
 
 
-#: Longest delay, in control steps: ten seconds at 1 kHz. A buffer of this length is made for each episode.
+#: Longest delay, in control steps: ten seconds at 1 kHz. Each episode has a buffer as long as its largest delay.
 LARGEST_DELAY = 10_000
 
 #: What a user may write where a process is expected; text is read in ``text.py``.
@@ -144,7 +144,7 @@ class DistributionDelay(BaseProcess):
         """Take the distribution of measured delays, in control steps (see ``in_steps``).
 
         :param delays: (n,)
-        :raises ValueError: for no, negative or fractional delays, or an array of another shape
+        :raises ValueError: for no delays, for negative, fractional or too large ones, or an array of another shape
         """
         drawn = np.asarray(delays)
         is_counts = drawn.ndim == 1 and drawn.size > 0 and np.issubdtype(drawn.dtype, np.integer)
@@ -198,9 +198,9 @@ def in_steps(milliseconds: float | np.ndarray, control_period: float) -> int | n
     """Convert delays to control steps, rounded up: what arrives between two steps is seen at the later one.
 
     :param milliseconds: a delay, or an array of them, >= 0
-    :param control_period: of one control step, in milliseconds, > 0
-    :raises ValueError: for negative or non-finite delays, a control period that is not positive, and more steps than
-        any delay has
+    :param control_period: length of one control step, in milliseconds, > 0
+    :raises ValueError: for negative or non-finite delays, a control period that is not positive, and more than
+        ``LARGEST_DELAY`` steps
 
     >>> FixedDelay(in_steps(70, control_period=20))
     FixedDelay(delay=4)
@@ -248,7 +248,7 @@ def packet_delays(delay: Delay, rng: np.random.Generator) -> Iterator[int | None
     """Draw an episode: the delays of the packets sent at steps 1, 2, ...; None for one that is lost.
 
     :return: an ``itertools.repeat`` where all packets of the episode take equally long
-    :raises ValueError: for anything but integers in 0..max_delay, or when the delays end; the iterator raises it too
+    :raises ValueError: for anything but integers in 0..max_delay, or when the delays end; the iterator raises it, too
     """
     process = as_process(delay)
     drawn = process.sample(rng)

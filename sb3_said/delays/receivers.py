@@ -12,7 +12,9 @@ from sb3_said.delays.processes import DelayProcess, packet_delays
 
 
 class Draws:
-    """The delays of an episode's packets, one after the other. Copied or pickled amid it, it draws them once more.
+    """The delays of an episode's packets, one after the other. A copy made within an episode draws the same delays.
+
+    A generator cannot be copied, so the copy first draws once more what the original has drawn.
 
     :param process: how long packets take
     :param rng: draws them; nobody else draws from it until the next episode
@@ -20,8 +22,8 @@ class Draws:
 
     def __init__(self, process: DelayProcess, rng: np.random.Generator):
         self.process, self.rng, self.n_drawn = process, rng, 0
-        bits: Any = rng.bit_generator  # whose type does not tell of pickling in every NumPy
-        self._began = copy.deepcopy(bits.__getstate__())  # with the count of its children
+        bits: Any = rng.bit_generator  # Any: in some NumPy versions its type does not declare __getstate__
+        self._began = copy.deepcopy(bits.__getstate__())  # which includes the number of spawned children
         self._delays = packet_delays(process, rng)
 
     def __next__(self) -> int | None:
@@ -29,12 +31,12 @@ class Draws:
         return next(self._delays)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name != "_delays"}  # a generator
+        return {name: value for name, value in vars(self).items() if name != "_delays"}  # cannot be copied
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
         bits: Any = self.rng.bit_generator
-        bits.__setstate__(copy.deepcopy(self._began))  # as in pickles
+        bits.__setstate__(copy.deepcopy(self._began))
         self._delays = packet_delays(self.process, self.rng)
         for _ in range(self.n_drawn):
             next(self._delays)
@@ -44,7 +46,7 @@ class NewestPacket:
     """Keeps the newest packet that has arrived, and drops one that a younger packet has overtaken.
 
     Packet t is sent at step t and arrives at t + its delay; packet 0 is there from the start. The age grows by at most
-    one a step and can fall by any amount. It never exceeds the process's ``max_delay``: where losses would make it, the
+    one a step and can fall by any amount. It never exceeds the process's ``max_delay``: if losses would make it, the
     packet that is ``max_delay`` steps old is delivered after all.
 
     :param process: how long packets take
@@ -52,7 +54,7 @@ class NewestPacket:
 
     def __init__(self, process: DelayProcess):
         self.process = process
-        self._arriving = [0] * (process.max_delay + 1)  # the newest packet due at t, at t % (max_delay + 1)
+        self._arriving = [0] * (process.max_delay + 1)  # at t % (max_delay + 1): the newest packet due at step t
 
     def reset(self, rng: np.random.Generator) -> None:
         """Start an episode: packet 0 is there, with age 0. Until the next reset, ``rng`` draws the delays."""
@@ -82,8 +84,8 @@ class NewestPacket:
 class IndependentDraw(NewestPacket):
     """Reads a buffer at an age drawn for every step, as the DOMDP of the paper (section 2) does.
 
-    An older observation may follow a younger one; under :class:`NewestPacket` it never does. A lost draw leaves the
-    observation that was read last.
+    An older observation may follow a younger one; under :class:`NewestPacket` it never does. If a draw is lost, the
+    observation read last stays.
 
     :param process: the age to read at each step
     """
@@ -108,7 +110,7 @@ class Actuator:
     def __init__(self, receiver: NewestPacket, memory: int):
         self.receiver = receiver
         self._sent: deque[np.ndarray] = deque(maxlen=int(receiver.process.max_delay) + 1)
-        self._ages: deque[int] = deque(maxlen=int(memory) + 1)  # of the youngest executed by each of the newest steps
+        self._ages: deque[int] = deque(maxlen=int(memory) + 1)  # of the youngest action executed by then, each step
 
     def reset(self, rng: np.random.Generator) -> None:
         """Start an episode. Until the next reset, ``rng`` draws the action delays."""
@@ -120,10 +122,10 @@ class Actuator:
         """Send an action (act_dim,), and return the one that this step executes, sent now or earlier."""
         age = self.receiver.step() if self._sent else 0
         self._sent.append(np.array(action))
-        self._ages.append(min(age, self._ages[-1] + 1) if self._ages else age)  # an older one may follow a younger
+        self._ages.append(min(age, self._ages[-1] + 1) if self._ages else age)  # one executed before may be younger
         return self._sent[-1 - age]
 
     def lag(self, age: int) -> int:
-        """Return how many actions, sent before the state of an age, do not show in it yet."""
-        # That is the age of the youngest action whose execution led there. No action leads to s_0.
+        """Return how many of the actions sent before the state of this age do not show in it yet."""
+        # That is how old the youngest executed action was at the step that led to this state. No step leads to s_0.
         return self._ages[-1 - age] if age < len(self._ages) else 0

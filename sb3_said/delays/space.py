@@ -12,9 +12,9 @@ KEYS = ("observation", "action_history", "delay")
 STATE_KEYS = ("state_history", "state_known")
 #: Key of the true state in ``info`` and in sampled observations; never part of an environment's observation space.
 UNDELAYED = "undelayed_observation"
-#: Key in ``info`` of what the task was given, where that is not the action sent last.
+#: Key in ``info`` of the action that the task executed, where each action takes a time of its own.
 EXECUTED = "executed_action"
-#: What to do about a wrapper that changed delayed observations, or actions.
+#: Advice in errors about a wrapper that changed delayed observations or actions.
 WRAPPER_ORDER = (
     "Wrappers that change observations or actions go below DelayedObservationWrapper, around the task itself; "
     "gymnasium.wrappers.FrameStackObservation and FlattenObservation do there what VecFrameStack does."
@@ -108,7 +108,7 @@ def holds_whole_numbers(space: spaces.Box) -> bool:
 def center_and_half(space: spaces.Box) -> tuple[np.ndarray, np.ndarray]:
     """Return the middle of the bounds and half their distance, (act_dim,) float64 each."""
     low, high = 0.5 * space.low.astype(np.float64), 0.5 * space.high.astype(np.float64)
-    return low + high, high - low  # halved first: their own type may not hold the distance
+    return low + high, high - low  # halved first: float64 may not hold the whole distance
 
 
 def delayed_space(
@@ -136,7 +136,7 @@ def delayed_space(
 
 
 class TaskSpaces(NamedTuple):
-    """What a task is without its delay, and how large that can be."""
+    """The spaces of a task without its delay, and its largest delay."""
 
     state: spaces.Box
     """of true states, (obs_dim,)"""
@@ -179,14 +179,14 @@ def _check_parts(space: spaces.Dict, state_box: spaces.Box, action_box: spaces.B
     shapes = {"observation": state_box.shape, "action_history": (max_delay, *action_box.shape), "delay": (1,)}
     if has_state_history(space):
         shapes |= {"state_history": (max_delay, *state_box.shape), "state_known": (max_delay,)}
-    for key, shape in shapes.items():  # before a space of max_delay is built, which may be 1e9
+    for key, shape in shapes.items():  # before a space is built for this max_delay, which may be 1e9
         if space[key].shape != shape:
             raise ValueError(
                 f"{key} was changed to {space[key]}, where DelayedObservationWrapper gives the shape {shape}. "
                 f"{WRAPPER_ORDER}"
             )
     for key, box in delayed_space(state_box, action_box, max_delay, has_state_history(space)).items():
-        is_state = key in ("observation", "state_history")  # whose bounds VecNormalize may set
+        is_state = key in ("observation", "state_history")  # VecNormalize may set their bounds
         if not is_state and space[key] != box:
             raise ValueError(
                 f"{key} was changed to {space[key]}, where DelayedObservationWrapper gives {box}. {WRAPPER_ORDER}"
@@ -201,9 +201,9 @@ def has_state_history(observation_space: spaces.Space[Any]) -> bool:
 def ages_of(env: Any) -> list[int]:
     """Return the ages that observations can have amid the episodes of an environment, [0] where nothing is delayed.
 
-    A simulator that hands out old observations by itself may say them as ``age_range``; else any may come.
+    A simulator that delays observations by itself may state them as ``age_range``; else every age may occur.
 
-    :param env: one environment, or an SB3 ``VecEnv`` of several that may have other delays; None has no delay
+    :param env: one environment, or an SB3 ``VecEnv`` of several, whose delays may differ; None has no delay
     """
     if env is None or not isinstance(env.observation_space, spaces.Dict):  # a plain task may have an age_range, too
         return [0]
@@ -214,18 +214,18 @@ def ages_of(env: Any) -> list[int]:
 
 
 def is_vectorised(env: Any) -> bool:
-    """Tell an SB3 ``VecEnv``, which this room does not import, from one environment."""
+    """Tell whether this is an SB3 ``VecEnv``, which this room does not import, or one environment."""
     return hasattr(env, "get_attr")
 
 
 def has_attribute(env: Any, name: str) -> bool:
-    """Tell whether an environment, or each of a ``VecEnv``'s, has an attribute: none that cannot be asked has.
+    """Tell whether an environment, or each of a ``VecEnv``'s, has an attribute; False if it cannot be asked.
 
-    To be asked first: a missing attribute ends the workers of a ``SubprocVecEnv``.
+    Ask before reading: to read a missing attribute ends the workers of a ``SubprocVecEnv``.
     """
     try:
         return env.has_attr(name) if is_vectorised(env) else env.has_wrapper_attr(name)
-    except NotImplementedError:  # of a simulator; SB3 takes an AttributeError for a no by itself
+    except NotImplementedError:  # from a simulator; SB3 itself takes an AttributeError for a no
         return False
 
 

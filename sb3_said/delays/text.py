@@ -1,4 +1,4 @@
-"""Delays as users write them on command lines and in YAML, text among them; reading a text runs no code."""
+"""Delays as users write them on command lines and in YAML, also as text; reading a text runs no code."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def make_process(delay: Delay | str) -> DelayProcess:
 def age_range(delay: Delay | str) -> tuple[int, int]:
     """Return the smallest and the largest age amid an episode, in control steps.
 
-    An episode's start has smaller ones. A user's own process without ``min_delay`` may bring any up to ``max_delay``.
+    At an episode's start ages are smaller. A user's own process without ``min_delay`` may have any up to ``max_delay``.
 
     :param delay: as :func:`make_process` takes it
     """
@@ -66,7 +66,7 @@ def parse_process(text: str) -> int | tuple[int, int] | DelayProcess:
 
 
 def as_text(delay: Delay | str) -> Delay | str:
-    """Return a delay as :func:`make_process` reads it back from JSON; a user's own process stays the object it is.
+    """Return a delay as JSON can hold it and :func:`make_process` reads it; a user's own process is returned unchanged.
 
     :param delay: as :func:`make_process` takes it
     """
@@ -83,7 +83,7 @@ def _evaluate(node: ast.expr) -> Any:
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in CLASSES:
         keywords: dict[str, Any] = {}
         for keyword in node.keywords:
-            if (name := str(keyword.arg)) in keywords:  # which Python's compiler refuses, and its parser does not
+            if (name := str(keyword.arg)) in keywords:  # Python's compiler refuses this, its parser does not
                 raise SyntaxError(f"{name} is given twice")
             keywords[name] = _evaluate(keyword.value)
         return CLASSES[node.func.id](*(_evaluate(arg) for arg in node.args), **keywords)

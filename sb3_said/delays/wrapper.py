@@ -56,11 +56,11 @@ class DelayedObservationWrapper(
         executes the newest that has arrived, and holds it until another arrives.
     :param max_delay: D, length of the action history; the largest delay by default. A larger one serves a model that
         was built for it.
-    :param receiver: of observations, and of actions that take a time each. ``"newest"`` keeps the newest packet that
-        has arrived; ``"independent"`` reads an age drawn anew at every step (paper, section 2)
+    :param receiver: of observations, and of actions where each takes a time of its own. ``"newest"`` keeps the newest
+        packet that has arrived; ``"independent"`` reads an age drawn anew at every step (paper, section 2)
     :param state_history: see above. Under ``"independent"`` states younger than ``observation`` may be known, under
-        ``"newest"`` none are. Refused where every action takes a time of its own: the actions sent are not those
-        executed there
+        ``"newest"`` none are. Refused where every action takes a time of its own: the actions sent are then not
+        those executed
     :raises ValueError: for other spaces, a bad delay, an unknown receiver, a ``max_delay`` below the largest delay, or
         a ``state_history`` where every action takes a time of its own
 
@@ -123,7 +123,7 @@ class DelayedObservationWrapper(
         self._states = np.zeros((n, *obs_space.shape), np.float32)  # s_{t-D..t}
         self._known = np.zeros(n, np.float32)  # which of these were handed out
         self._shown = 0  # age of the state that was handed out last
-        self._is_over = True  # the episode, or none has begun
+        self._is_over = True  # the episode is over, or none has begun
 
     def make_receivers(self) -> tuple[NewestPacket, Actuator | None]:
         """Return new receivers of observations, and of actions where each takes a time of its own."""
@@ -135,12 +135,12 @@ class DelayedObservationWrapper(
 
     @property
     def age_range(self) -> tuple[int, int]:
-        """The smallest and the largest ``delay`` amid an episode; numbers, for workers of vectorised environments."""
+        """The smallest and the largest ``delay`` amid an episode: plain numbers, which workers can send."""
         return age_range(self.process)
 
     @property
     def task_id(self) -> str | None:
-        """Id of the task, where it has one; a word, for workers, who cannot send every ``spec``."""
+        """Id of the task, where it has one: a text, since workers cannot send every ``spec``."""
         return None if self.spec is None else self.spec.id
 
     @property
@@ -187,7 +187,7 @@ class DelayedObservationWrapper(
             raise ValueError(f"The action has the shape {np.shape(action)}, expected {self._actions.shape[1:]}.")
         state: Any
         executed = action if self.actuator is None else self.actuator.execute(action)
-        state, reward, terminated, truncated, info = self.env.step(np.array(executed))  # which a task may change
+        state, reward, terminated, truncated, info = self.env.step(np.array(executed))  # a copy: a task may change it
         self._check_answer(state, info)
         self._is_over = bool(terminated or truncated)
         _append(self._actions, scale_action(action, self._task_action_space))
@@ -196,7 +196,7 @@ class DelayedObservationWrapper(
         return self._observe(state, age, lag), reward, terminated, truncated, self._with_own(info, shown)
 
     def _check_answer(self, state: Any, info: Any) -> None:
-        """Refuse what NumPy would broadcast or cast in silence, with a ``ValueError``."""
+        """:raises ValueError: for an answer of the task that NumPy would broadcast or cast in silence"""
         given, shape = np.asarray(state), self._states.shape[1:]
         if given.shape != shape or given.dtype.kind not in "biuf" or not isinstance(info, dict):
             raise ValueError(
@@ -221,7 +221,7 @@ class DelayedObservationWrapper(
         return obs
 
     def _with_own(self, info: dict[str, Any], executed: np.ndarray | None = None) -> dict[str, Any]:
-        """Return the task's info with this wrapper's entries, and without what it has under the same names."""
+        """Return the task's info with this wrapper's entries, in place of the task's own under these names."""
         receivers = [self.receiver] if self.actuator is None else [self.receiver, self.actuator.receiver]
         return {
             **{key: value for key, value in info.items() if key != EXECUTED},

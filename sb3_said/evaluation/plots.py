@@ -22,9 +22,9 @@ from sb3_said.evaluation.statistics import Interval, Summary, confidence_interva
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Okabe and Ito's palette without its yellow: told apart by colour-blind readers too.
+# Okabe and Ito's palette without its yellow: colour-blind readers can tell it apart, too.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-N_DELAYS_PLOTTED = 5  # where a planner logged the errors of more delays than can be told apart
+N_DELAYS_PLOTTED = 5  # of a planner that logged errors at more delays than readers can tell apart
 MARKERS = "osD^vPX*"
 UPDATES = "planner/n_updates"  # column of progress.csv
 
@@ -59,7 +59,7 @@ def colors(n: int, ordered: bool = False) -> list[str]:
     """Return n colours, no two alike.
 
     :param n: lines to draw
-    :param ordered: from dark to light, for lines of a growing number
+    :param ordered: from dark to light, for lines in the order of a number
     """
     from matplotlib import colormaps
     from matplotlib.colors import to_hex
@@ -70,9 +70,9 @@ def colors(n: int, ordered: bool = False) -> list[str]:
 
 
 def check_file(path: str | Path) -> None:
-    """Refuse a file that :func:`save` has no format for, before what it is to show is made.
+    """Refuse a file that :func:`save` cannot write, before the data of its plot is made.
 
-    :raises ValueError: for its suffix
+    :raises ValueError: for a suffix that names no format
     :raises ImportError: without matplotlib
     """
     formats = panels()[0].get_figure(root=True).canvas.get_supported_filetypes()  # type: ignore[union-attr]  # as below
@@ -87,17 +87,17 @@ def save(ax: Axes, path: str | Path) -> None:
 
 
 def evaluation_files(run: Path) -> list[Path]:
-    """Return where a run keeps the evaluations of training, of a SAID run's expert first; not all need be there."""
+    """Return the files of a run's evaluations in training, first those of a SAID run's expert. Not all need exist."""
     return [run / "expert" / "evaluations.npz", run / "evaluations.npz"]
 
 
 def plot_learning_curve(run: str | Path, ax: Axes | None = None, window: int = 20) -> Axes:
     """Plot the returns of training, and of the evaluations beside it, over environment steps.
 
-    Its colours are none of a planner's and an expert's in :func:`plot_returns`, so that both fit into one figure.
+    Its colours differ from those of planner and expert in :func:`plot_returns`, so that both fit into one figure.
 
-    :param run: folder with ``*.monitor.csv`` (SB3's Monitor), ``evaluations.npz`` (SB3's EvalCallback), or both; of a
-        run of SAID the latter are the trained agent's, and those of the expert lie in ``expert/``
+    :param run: folder with ``*.monitor.csv`` (SB3's Monitor), ``evaluations.npz`` (SB3's EvalCallback), or both; in a
+        SAID run these evaluations are the trained agent's, and those of its expert lie in ``expert/``
     :param ax: to draw on; a new figure by default
     :param window: training episodes in the running mean
     :raises ValueError: when the folder holds neither file
@@ -118,7 +118,7 @@ def plot_learning_curve(run: str | Path, ax: Axes | None = None, window: int = 2
         if path.is_file():
             try:
                 with np.load(path) as file:
-                    known = ~np.isnan(file["results"]).any(axis=1)  # at step 0 there is no planner
+                    known = ~np.isnan(file["results"]).any(axis=1)  # NaN at step 0, before there is a planner
                     eval_steps, results = file["timesteps"][known], file["results"][known]
             except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
                 warnings.warn(f"{path} is damaged, as a kill leaves it, and left out: {error}.", stacklevel=2)
@@ -126,7 +126,7 @@ def plot_learning_curve(run: str | Path, ax: Axes | None = None, window: int = 2
             value, low, high = _bounds([confidence_interval(row) for row in results])
             ax.plot(eval_steps, value, color=color, marker="o", markersize=3, label=f"{name}, 95 % interval")
             ax.fill_between(eval_steps, low, high, color=color, alpha=0.2, linewidth=0)
-    ax.set_xlabel("environment steps" if len(steps) else "training steps")  # of logs, gradient steps
+    ax.set_xlabel("environment steps" if len(steps) else "training steps")  # gradient steps in learning from logs
     ax.set_ylabel("return of an episode (undiscounted)")
     ax.legend(frameon=False)
     return ax
@@ -157,7 +157,7 @@ def plot_over_delays(table: Mapping[str, Mapping[int | str, npt.ArrayLike]], tit
     """Plot mean returns with their intervals: a line over fixed delays, and points for each random delay.
 
     :param table: for each agent its returns, by the delay in control steps or, for a random one, by its name; each
-        (n_episodes,), or (n_seeds, n_episodes) of several training seeds. What an agent lacks is left out
+        (n_episodes,), or (n_seeds, n_episodes) of several training seeds. Delays that an agent lacks are left out
     :param title: of the figure: name the task
     :return: a panel for each kind of delay there is, on one figure, with the same axis of returns
     :raises ValueError: for a table without returns
@@ -190,7 +190,7 @@ def plot_over_delays(table: Mapping[str, Mapping[int | str, npt.ArrayLike]], tit
             ax.set_xlim(-0.5, len(random) - 0.5)
             ax.set_xlabel("random delay")
         ax.sharey(axes[0])
-    axes[0].autoscale_view()  # sharing alone leaves the limits of the first
+    axes[0].autoscale_view()  # sharing alone keeps the limits of the first panel
     axes[0].set_ylabel("return of an episode (undiscounted)")
     handles, labels = axes[0].get_legend_handles_labels()
     axes[0].figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
@@ -200,7 +200,7 @@ def plot_over_delays(table: Mapping[str, Mapping[int | str, npt.ArrayLike]], tit
 def plot_planner_errors(run: str | Path, kind: Literal["present", "action"], ax: Axes | None = None) -> Axes:
     """Plot how far the planner is off on held-out windows, beside an MLP regression trained on the same windows.
 
-    One colour for each delay d, the darker the shorter, for five of them where there are many. Solid lines are the
+    Each delay d has a colour, the darker the shorter. Of many delays five are shown. Solid lines are the
     planner's ``planner/{kind}_error_d*``, dashed ones the MLP's ``planner/{kind}_error_mlp_d*``. A planner above its
     dashed line is not trained yet.
 
@@ -222,7 +222,7 @@ def plot_planner_errors(run: str | Path, kind: Literal["present", "action"], ax:
             f"{run} has no progress.csv with planner/{kind}_error_d*; give the run of a planner's training."
         )
     ax = panels()[0] if ax is None else ax
-    # Over both kinds, so that a delay has the same colour in both plots.
+    # Delays of both kinds of error, so that a delay has the same colour in both plots.
     delays = sorted({int(d) for name in names for d in re.findall(r"planner/\w+_error(?:_mlp)?_d(\d+)", name)})
     if len(delays) > N_DELAYS_PLOTTED + 1:  # the shortest, the longest, and some between
         delays = [delays[round(k)] for k in np.linspace(0, len(delays) - 1, N_DELAYS_PLOTTED)]
@@ -258,9 +258,9 @@ def _in_lines(name: str) -> str:
 
 
 def _running_total(counts: Sequence[float]) -> list[float]:
-    """Join counts of updates into one; each training of the planner counts from 0.
+    """Join the counts of several trainings of the planner, each from 0, into one count of updates.
 
-    A resumed training steps back as well, to its checkpoint, which lies after its first row.
+    The count also falls where a training was resumed, but only to its checkpoint, which lies after its first row.
     """
     first = next((count for count in counts if count > 0), 0.0)
     before, last, joined = 0.0, 0.0, []

@@ -28,16 +28,16 @@ class Rollout:
     """What ``rollout`` measured."""
 
     returns: np.ndarray
-    """(n_episodes,) float64, sum of the rewards, in the order of the reset seeds: those below an SB3 ``Monitor`` where
-    the environment has one, and so the task's own"""
+    """(n_episodes,) float64, sum of the rewards, in the order of the reset seeds. With an SB3 ``Monitor``, the rewards
+    below it count, which are the task's own"""
     lengths: np.ndarray
     """(n_episodes,) int64, in control steps"""
     terminated: np.ndarray
-    """(n_episodes,) bool, whether the task ended the episode (in MuJoCo's, by a fall), and no time limit"""
+    """(n_episodes,) bool, whether the task ended the episode (in MuJoCo by a fall), not a time limit"""
     action_changes: np.ndarray
     """(n_episodes,) float64, mean |a_t - a_{t-1}| over steps and entries, in halves of the action space's range"""
     successes: np.ndarray | None
-    """(n_episodes,) bool, ``info["is_success"]`` at each episode's end; None of a task that does not tell it"""
+    """(n_episodes,) bool, ``info["is_success"]`` at each episode's end; None if the task does not tell it"""
 
     def summary(self, label: str, latency: Latency | None = None) -> Summary:
         """Return a row of an evaluation.
@@ -139,9 +139,9 @@ def rollout(
 
 
 def warn_if_long(steps: int, episode: int | None = None) -> None:
-    """Warn once of an episode that may have no end, as the task's author may not know.
+    """Warn once of an episode that may never end, ``LONG`` steps after its start.
 
-    :param steps: that it has lasted so far
+    :param steps: how many it has lasted so far
     :param episode: its number, where it has one
     """
     if steps == LONG:
@@ -154,7 +154,7 @@ def warn_if_long(steps: int, episode: int | None = None) -> None:
 
 
 def collect_observations(env: EnvMaker, n_observations: int, seed: int) -> Observation:
-    """Gather observations along random actions, to time decisions on.
+    """Gather observations along random actions, for timing decisions.
 
     :param env: an environment id, or a function that makes an environment
     :param n_observations: how many, >= 1
@@ -232,16 +232,16 @@ def _as_they_are(model: PolicyPredictor) -> Callable[[Observation], Observation]
 
 
 def _monitored(env: gym.Env[Any, Any], counted: float) -> float:
-    """Return what a Monitor has counted, below wrappers that change rewards or end episodes; without one, the given."""
+    """Return what a Monitor counted, below wrappers that change rewards or end episodes; without one, ``counted``."""
     from stable_baselines3.common.env_util import unwrap_wrapper
-    from stable_baselines3.common.monitor import Monitor  # with the room, torch would be imported
+    from stable_baselines3.common.monitor import Monitor  # at the top, this would import torch
 
     monitor = unwrap_wrapper(env, Monitor)
     return sum(monitor.rewards) if isinstance(monitor, Monitor) else counted
 
 
 def _half_range(space: gym.Space[Any]) -> np.ndarray:
-    """Return half the distance of a Box's bounds, and 1 where there is none or no end to it."""
+    """Return half the distance between a Box's bounds, and 1 where it is 0 or infinite, and for other spaces."""
     if not isinstance(space, gym.spaces.Box):
         return np.ones(())
     half = space.high.astype(np.float64) / 2 - space.low.astype(np.float64) / 2

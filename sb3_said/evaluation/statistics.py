@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import stdtrit
 
-# With fewer units a bootstrap interval covers less than Student's t, of normal and of skewed values alike.
+# With fewer units a bootstrap interval covers less than Student's t, for normal and for skewed values.
 FEWEST_RESAMPLED = 10
 
 
@@ -74,11 +74,11 @@ class Summary:
     worst_tenth: float
     """mean of the lowest tenth of the returns, of at least one"""
     terminations: int | None = None
-    """episodes that the task ended (in MuJoCo's, by a fall), and no time limit"""
+    """episodes that the task ended (in MuJoCo by a fall), not a time limit"""
     mean_action_change: Interval | None = None
     """mean |a_t - a_{t-1}| in halves of the action space's range: how rough the motion is"""
     successes: int | None = None
-    """episodes that the task called one at their end"""
+    """episodes that the task called a success at their end"""
 
     @classmethod
     def from_episodes(
@@ -122,7 +122,7 @@ class Summary:
 def worst_tenth(returns: npt.ArrayLike) -> float:
     """Return the mean of the lowest tenth of returns, rounded up to at least one.
 
-    :param returns: (n_episodes,), or (n_seeds, n_episodes), of which all count alike
+    :param returns: (n_episodes,), or (n_seeds, n_episodes), where all episodes count alike
     """
     ordered = np.sort(np.asarray(returns, dtype=np.float64), axis=None)
     return float(ordered[: math.ceil(len(ordered) / 10)].mean())
@@ -137,19 +137,19 @@ def confidence_interval(
 ) -> Interval:
     """Interval of a statistic of independent units: episodes of one agent, or training seeds with their episodes.
 
-    Values of one unit share its luck. So they are left out or drawn together, and their own spread counts as part of
-    the units'. The interval's ``method`` says how it was made:
+    Values of one unit share its luck, so they are left out or drawn together. Their own spread counts as part of the
+    units' spread. The interval's ``method`` says how it was made:
 
     - ``"Student's t"``, below 10 units: value +- t_{n-1} times the jackknife's standard error, which leaves out one
-      unit at a time (Efron and Stein 1981). For the mean it is the usual t interval of the units' means. Of three to
-      five normal units a bootstrap interval that is called 95 % covers 73 to 83 %, and jumps from one resample to the
-      next as values change by nothing. It needs a smooth statistic: of a median it covers less than it says.
+      unit at a time (Efron and Stein 1981). For the mean it is the usual t interval of the units' means. With three
+      to five normal units, a nominal 95 % bootstrap interval covers only 73 to 83 %, and jumps when values hardly
+      change. The jackknife needs a smooth statistic: for a median, the interval covers less than it says.
     - ``"BCa bootstrap"``, from 10 units on, by SciPy. Returns of control tasks are skewed: a few episodes fall far
-      below many good ones. BCa corrects for that, and the other two do not.
+      below many good ones. BCa corrects for that, and the other two methods do not.
     - ``"percentile bootstrap"`` where BCa is undefined, because leaving out any one unit changes nothing.
 
     :param values: (n,), one for each unit; or (n_seeds, n_episodes), whose rows are the units
-    :param statistic: of (..., k) along ``axis=-1``, such as ``np.mean``; of all values of all units
+    :param statistic: takes all values of all units, (..., k) along ``axis=-1``, such as ``np.mean``
     :param confidence: probability that the interval is to cover, in (0, 1)
     :param n_resamples: bootstrap samples
     :param seed: of the resampling; fixed, so that the same episodes give the same interval
@@ -163,7 +163,7 @@ def confidence_interval(
     _check_confidence(confidence)
 
     def of_units(rows: np.ndarray, axis: int = -1) -> Any:
-        """Return the statistic of the values of units, whose numbers are on the last axis: (..., m) -> (...)."""
+        """Return the statistic over the units whose numbers are on the last axis: (..., m) -> (...)."""
         return statistic(units[rows.astype(np.intp)].reshape(*rows.shape[:-1], -1), axis=-1)
 
     everyone = np.arange(n)
@@ -175,7 +175,7 @@ def confidence_interval(
         error = math.sqrt((n - 1) * np.var(without_one))
         half = float(stdtrit(n - 1, (1 + confidence) / 2)) * error
         return Interval(value, value - half, value + half, confidence, n, "Student's t")
-    from scipy.stats import DegenerateDataWarning, bootstrap  # a second, which a command's --help can do without
+    from scipy.stats import DegenerateDataWarning, bootstrap  # takes a second, which a command's --help saves
 
     method = "BCa bootstrap"
     # In parts, as all samples together take gigabytes
@@ -194,8 +194,8 @@ def stratified_interval(
 ) -> Interval:
     """Interval of the mean over training seeds and episodes: a bootstrap that draws seeds, then episodes of each.
 
-    It has both spreads, as the stratified bootstrap of Agarwal et al. 2021 (arXiv 2108.13264) has runs within tasks.
-    Of three to five seeds it covers less than it says; :func:`confidence_interval` then gives Student's t over seeds.
+    It counts both spreads, as the stratified bootstrap of Agarwal et al. 2021 (arXiv 2108.13264) draws runs within
+    tasks. With three to five seeds it covers less than it says; use :func:`confidence_interval` (Student's t) there.
 
     :param returns: (n_seeds, n_episodes)
     :param confidence: probability that the interval is to cover, in (0, 1)
@@ -221,7 +221,7 @@ def stratified_interval(
 
 
 def _holding(value: float, low: float, high: float) -> tuple[float, float]:
-    """Return bounds that hold the value: of equal values, means that are summed in another order miss it by a bit."""
+    """Return bounds that include the value: means of equal values, summed in another order, miss it by rounding."""
     return min(float(low), value), max(float(high), value)
 
 

@@ -60,8 +60,8 @@ class SafeSaveMixin(Learner):
     """Makes an SB3 off-policy algorithm save to and load from files without pickle. Name it before the algorithm.
 
     Every argument of the constructor after ``policy, env`` must be an attribute of the same name. A subclass adds to
-    ``own_classes`` the classes that its constructor takes where none are given, and to ``settings_arguments`` those of
-    its arguments that are dicts of settings, which ``load`` merges entry by entry.
+    ``own_classes`` the classes that its constructor takes by default, and to ``settings_arguments`` those of its
+    arguments that are dicts of settings; ``load`` merges these entry by entry.
     """
 
     own_classes: ClassVar[tuple[type, ...]] = ()
@@ -70,7 +70,7 @@ class SafeSaveMixin(Learner):
     task: str | None = None
     """id of the Gymnasium task that it was made for, where that is known"""
     reads_normalized: bool = False
-    """whether its observations went through a ``VecNormalize``, whose statistics a file of their own has"""
+    """whether its observations went through a ``VecNormalize``; its statistics have a file of their own"""
 
     def save(self, path: PathOrFile, compact: bool = False) -> None:  # type: ignore[override]  # no exclude, include
         """Write the agent to a file, without its environment and replay buffer.
@@ -222,11 +222,11 @@ class SafeSaveMixin(Learner):
             n_updates = saved["counters"]["_n_updates"]
             check_numbers("_n_updates", n_updates)
             take_parameters(self, fitting_parameters(self, saved["parameters"], exact_match), exact_match)
-            self._n_updates = max(self._n_updates, int(n_updates))  # that made them; a compact file shows no others
+            self._n_updates = max(self._n_updates, int(n_updates))  # that made these; compact files tell it only here
 
     @classmethod
     def _read_arguments(cls, saved: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
-        """Return the constructor arguments of a file, with those that are given in their places.
+        """Return the constructor arguments of a file; those that are given replace the file's.
 
         :raises ValueError: for names, types or numbers that the constructor does not take
         """
@@ -271,19 +271,19 @@ class SafeSaveMixin(Learner):
 
     @classmethod
     def _refuse_unknown(cls, given: Iterable[str], known: set[str]) -> None:
-        """:raises TypeError: for an argument that is none of those known, with the nearest name of all there are"""
+        """:raises TypeError: for an argument that is not known, with the nearest known name"""
         for unknown in sorted(set(given) - known):
             names = sorted((cls._argument_names() | {"device", "tensorboard_log"}) - {"policy_class"})
             raise TypeError(f"{cls.__name__} has no argument {unknown}; {instead_of(unknown, names)}")
 
     def _check_file(self, saved: dict[str, Any]) -> None:
-        """Look at a file whose parameters are about to be taken over; an algorithm may refuse more.
+        """Check a file before its parameters are taken over; an algorithm may refuse more.
 
-        :raises ValueError: for one that does not go with this agent, such as of networks with another activation
+        :raises ValueError: for a file that does not go with this agent, such as one with another activation
         """
 
         def computes(policy_kwargs: dict[str, Any] | None) -> dict[str, Any]:
-            of_shapes = ("net_arch", "optimizer_class", "optimizer_kwargs")  # or of no answer
+            of_shapes = ("net_arch", "optimizer_class", "optimizer_kwargs")  # or without effect on answers
             return {name: value for name, value in (policy_kwargs or {}).items() if name not in of_shapes}
 
         given = saved.get("arguments", {}).get("policy_kwargs", self.policy_kwargs)  # a checkpoint has no arguments
@@ -292,7 +292,7 @@ class SafeSaveMixin(Learner):
             raise ValueError(f"its policy_kwargs are {theirs}, and this agent's {own}; make it with the same")
 
     def _adapt_saved(self, saved: dict[str, Any], changed: set[str]) -> dict[str, Any]:
-        """Return what to take over of a file where the caller of ``load`` has changed some arguments."""
+        """Return what to take over from a file if the caller of ``load`` has changed some arguments."""
         return saved
 
     def _take_settings(self, saved: dict[str, Any]) -> None:
@@ -303,7 +303,7 @@ class SafeSaveMixin(Learner):
 
 
 def task_of(metadata: dict[str, Any]) -> str | None:
-    """Return the task that an agent's file names; none whose id names a module, which ``gymnasium.make`` would import.
+    """Return the task that an agent's file names; None if its id names a module: ``gymnasium.make`` would import it.
 
     :param metadata: of the file, as :func:`~sb3_said.files.archive.load_metadata` returns it
     """
@@ -317,7 +317,7 @@ class SafePolicyMixin(BasePolicy):
     def save(self, path: PathOrFile) -> None:
         """Write networks and constructor arguments, all that ``predict`` needs; optimizers are the algorithm's.
 
-        :param path: where to write, as it is. Or a binary file object.
+        :param path: where to write; no suffix is added. Or a binary file object.
         :raises ValueError: if a constructor argument cannot be written without pickle
         """
         arguments = self._get_constructor_parameters()

@@ -71,7 +71,7 @@ def save_tree(path: PathOrFile, tree: Any, metadata: dict[str, Any] | None = Non
 def seal(archive: zipfile.ZipFile) -> bytes:
     """Return the digest of an archive's names and checksums, which :func:`save_tree` leaves as its comment.
 
-    It tells a file that was changed after it was saved. It is no signature: whoever writes a file can seal it.
+    It shows whether a file was changed after it was saved. It is no signature: whoever writes a file can seal it.
     """
     members = "".join(f"{info.filename} {info.CRC}\n" for info in archive.infolist())
     return hashlib.sha256(members.encode()).hexdigest().encode()
@@ -132,7 +132,7 @@ def readable(source: PathOrFile, explained: tuple[type[Exception], ...] = (Saved
     except explained as error:
         raise SavedFileError(f"Cannot load {name}: {str(error).rstrip('.')}.") from error
     except Exception as error:
-        is_others = isinstance(error, (Warning, th.OutOfMemoryError))  # the second of a GPU
+        is_others = isinstance(error, (Warning, th.OutOfMemoryError))  # no fault of the file
         if is_others or (isinstance(error, OSError) and error.filename is not None):
             raise  # an OSError with a name is from opening the file, and says so
         if isinstance(error, MemoryError):
@@ -242,7 +242,7 @@ def _read_array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
     with archive.open(name) as member:
         if np.lib.format.read_magic(member) != (1, 0):
             raise SavedFileError(f"{name} is of another version of NumPy's format than 1.0")
-        read_header: Any = np.lib.format.read_array_header_1_0  # whose type lacks max_header_size in NumPy 2.2
+        read_header: Any = np.lib.format.read_array_header_1_0  # Any: its type lacks max_header_size in NumPy 2.2
         shape, _, dtype = read_header(member, max_header_size=_MAX_HEADER)
         _check_dtype(dtype)  # a stranger's bytes as object pointers would be an attack
         n_bytes = member.tell() + math.prod(shape) * dtype.itemsize
@@ -269,7 +269,7 @@ def with_suffix(path: PathOrFile, suffix: str) -> PathOrFile:
 def existing(path: PathOrFile, suffix: str = ".zip") -> PathOrFile:
     """Add a suffix where the path alone is no file, as SB3 does.
 
-    :raises FileNotFoundError: where neither is one
+    :raises FileNotFoundError: where neither is a file
     """
     if isinstance(path, (str, os.PathLike)) and not os.path.isfile(path):
         alone, path = os.fspath(path), f"{os.fspath(path)}{suffix}"

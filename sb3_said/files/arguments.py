@@ -23,7 +23,7 @@ from torch.nn.modules import activation
 
 from sb3_said.files.archive import SavedFileError
 
-# Tables, and no look-up by a stranger's name: nothing is imported or found because a file says so.
+# Tables: nothing is imported or looked up because a file names it.
 _CLASSES: dict[str, type] = {
     **{f"torch.nn.{name}": getattr(activation, name) for name in activation.__all__},
     **{f"torch.optim.{name}": cls for name, cls in vars(th.optim).items() if type(cls) is type},
@@ -71,7 +71,7 @@ def as_data(value: Any, where: str) -> Any:
 
 
 def instead_of(unknown: str, names: Sequence[str]) -> str:
-    """Return how an error about an unknown name ends: with the nearest of the names that there are, or all of them."""
+    """Return the end of an error about an unknown name: the nearest of the known names, or all of them."""
     nearest = get_close_matches(unknown, names, n=1)
     return f"did you mean {nearest[0]}?" if nearest else f"it has {', '.join(names)}."
 
@@ -101,7 +101,7 @@ def from_data(node: Any) -> Any:
 
 
 def check_noise(noise: Any, action_space: spaces.Space[Any]) -> None:
-    """Hold action noise from a file against the actions.
+    """Check action noise from a file against the action space.
 
     :raises SavedFileError: for another shape, or a negative scale
     """
@@ -142,7 +142,7 @@ def space_from_data(node: Any) -> spaces.Space[Any]:
 
 
 def replaced(settings: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
-    """Return the old values of what ``given`` changes; of a dict, of its changed entries alone."""
+    """Return the old values of what ``given`` changes; in a dict, those of the changed entries alone."""
     others = {}
     for name, now in given.items():
         before = settings.get(name, now)

@@ -60,7 +60,7 @@ def replacing(target: PathOrFile) -> Iterator[IO[bytes]]:
             Path(scratch.name).unlink(missing_ok=True)
             raise
     except OSError as error:
-        error.filename = error.filename or str(path)  # that of a full disk has none
+        error.filename = error.filename or str(path)  # the error of a full disk has none
         raise
 
 
@@ -79,7 +79,7 @@ def check_writable(target: str | os.PathLike[str]) -> None:
             with TemporaryFile(dir=folder):
                 pass
         except OSError as error:
-            error.filename = os.fspath(target)  # and not that of the file that was tried
+            error.filename = os.fspath(target)  # not that of the temporary file
             raise
 
 
@@ -94,7 +94,7 @@ def remove_abandoned(folder: Path, name: str | None = None) -> None:
     :param name: of the target that they were to replace; all by default
     """
     for left in folder.glob(f".{'*' if name is None else glob.escape(name)}." + "[0-9a-f]" * 8 + ".tmp"):
-        # One that cannot be removed does no harm; one that is being written is locked, and on Windows stays.
+        # A file that cannot be removed does no harm. One that is being written is locked; Windows removes no open file.
         with contextlib.suppress(OSError), contextlib.ExitStack() as stack:
             if fcntl is not None:
                 fcntl.flock(stack.enter_context(open(left, "r+b")), fcntl.LOCK_EX | fcntl.LOCK_NB)

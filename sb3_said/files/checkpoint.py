@@ -40,7 +40,7 @@ class CheckpointClock:
         self.wait()
 
     def wait(self) -> None:
-        """Begin to wait for the next."""
+        """Start waiting for the next checkpoint."""
         size = self.path.stat().st_size if self.path.exists() else 0
         self._due = time.monotonic() + max(SECONDS, size / BYTES_A_SECOND)
 
@@ -48,9 +48,9 @@ class CheckpointClock:
         return time.monotonic() >= self._due
 
     def save(self, what: str, state: dict[str, Any], metadata: dict[str, Any] | None = None) -> bool:
-        """Write it and wait for the next; return whether it is written.
+        """Write a checkpoint and wait for the next; return whether it is written.
 
-        A full disk is no reason to lose what learns: a warning says so, and the checkpoint before stays.
+        A full disk is no reason to end the training: it only warns, and the previous checkpoint stays.
 
         :param what: the checkpoint's name, for the warning
         """
@@ -72,14 +72,14 @@ class TrainingCheckpointCallback(BaseCallback):
     """Write everything that a run needs to go on, from time to time and when learning ends.
 
     Model, optimizers, replay buffer, counters, normalisation statistics, evaluations so far and random states go into
-    one file, which replaces the previous one only once it is whole; with them how long SB3's monitor files were then.
+    one file, which replaces the previous one only once it is whole. It also has the length of SB3's monitor files.
 
     :param folder: of the run; the file is ``checkpoint.zip`` in it
     :param save_freq: environment steps between two checkpoints. By default time decides: ten minutes, and longer where
         the replay is large, so that checkpoints write at most half a megabyte a second (2.4 GB every 80 minutes)
-    :param should_stop: asked before every rollout, where nothing is half done; learning then ends with a
+    :param should_stop: asked before every rollout, where nothing is half done; True ends learning with a
         ``KeyboardInterrupt``
-    :param keeps_replay: False writes a checksum of the replay instead, where it is a dataset that a resume reads again
+    :param keeps_replay: False writes only a checksum of the replay, for a dataset that a resume reads again
     """
 
     model: SafeSaveMixin
@@ -104,13 +104,13 @@ class TrainingCheckpointCallback(BaseCallback):
         is_there = self.path.exists()
         self._saved_at = self._tried_at if self._tried_at > 0 and is_there and self._is_own() else -1
         self._clock.wait()
-        # A resume makes an agent anew: it has the replay that this one was given from nowhere else, and would take a
-        # checkpoint that another run has left in this folder
+        # A resume makes a new agent, which has only the checkpoint. So write now a replay that this agent was given,
+        # and replace a checkpoint that another run has left in this folder.
         if self._saved_at < 0 and (is_there or (self.keeps_replay and _replay_buffer(self.model).size() > 0)):
             self.save()
 
     def _is_own(self) -> bool:
-        """Tell whether the checkpoint that is there is of this agent as it is now."""
+        """Tell whether the existing checkpoint is of this agent as it is now."""
         try:
             return bool(load_metadata(self.path)["metadata"].get("at") == self._now())
         except SavedFileError:
@@ -140,9 +140,9 @@ class TrainingCheckpointCallback(BaseCallback):
     def save(self) -> bool:
         """Write a checkpoint now, if there is anything new; return whether the file has it all.
 
-        Where it cannot be written, as on a full disk, a warning says so, and the one before stays.
+        If it cannot be written, as on a full disk, a warning says so, and the previous checkpoint stays.
 
-        :raises ValueError: for a run that has gone wrong, whose state is not finite; the one before stays
+        :raises ValueError: for a run whose state is not finite; the previous checkpoint stays
         """
         self._tried_at = self.model.num_timesteps
         if self._tried_at != self._saved_at:
@@ -204,7 +204,7 @@ def training_state(
 
 
 def checksum(model: OffPolicyAlgorithm) -> int:
-    """Return a number that tells replays apart, of all that they teach."""
+    """Return a checksum of all that a replay teaches."""
     return crc32(part for part in _replay_buffer(model).state_dict().values() if isinstance(part, np.ndarray))
 
 
@@ -214,7 +214,7 @@ def crc32(arrays: Iterable[np.ndarray]) -> int:
 
 
 def restore_training(model: SafeSaveMixin, path: str | Path, callback: BaseCallback | None = None) -> None:
-    """Bring a newly made model to where a checkpoint was written. Its environment starts a new episode.
+    """Bring a newly made model to the state of a checkpoint. Its environment starts a new episode.
 
     The environment is seeded from the run's seed and the step reached, so two resumes from one checkpoint are the same
     and neither repeats the run's first episodes.
@@ -242,7 +242,7 @@ def restore_training(model: SafeSaveMixin, path: str | Path, callback: BaseCallb
         restore_random_state(state["random"])
     model._last_obs = None  # the replay's newest episode is not the environment's, even where it looks so
     if model.seed is not None and model.env is not None:
-        # A seed that no other use has: large, where those of runs, evaluation and tuning are small numbers.
+        # A seed that nothing else uses: it is large, those of runs, evaluation and tuning are small.
         drawn = np.random.SeedSequence([model.seed, model.num_timesteps]).generate_state(1)[0]
         seed = 2**30 + int(drawn) % 2**30
         model.env.seed(seed)

@@ -1,4 +1,4 @@
-"""What a file claims, held against what it is to be read into, before anything is built or taken over."""
+"""Checks of what a file claims, before anything is built or taken over."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from torch.nn.modules import module as torch_hooks
 from sb3_said.files.archive import SavedFileError
 
 _LARGEST = 2.0**63
-#: Where a number outside this range is a mistake or takes memory: names of SB3's off-policy algorithms.
+#: Ranges of SB3's off-policy arguments: a number outside is a mistake or takes too much memory.
 RANGES: dict[str, tuple[float, float]] = {
     "learning_rate": (0, _LARGEST),
     "buffer_size": (1, 1e9),
@@ -35,7 +35,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "stats_window_size": (1, 1e9),
     "seed": (0, 2**32 - 1),
 }
-# Of torch's optimizers: counts, and means of squares, whose roots would be no numbers.
+# State of torch's optimizers: counts, and means of squares, of which roots are taken.
 _NEVER_NEGATIVE = ("step", "exp_avg_sq", "max_exp_avg_sq", "square_avg", "sum", "exp_inf")
 
 
@@ -43,9 +43,9 @@ _NEVER_NEGATIVE = ("step", "exp_avg_sq", "max_exp_avg_sq", "square_avg", "sum", 
 
 
 def check_argument(name: str, value: Any, cls: type) -> None:
-    """Hold a constructor argument against its range and the type that the first constructor with that name declares.
+    """Check a constructor argument against its range and its type in the first constructor that names it.
 
-    :param cls: whose constructors they are, its own and those that it inherits
+    :param cls: its own constructor comes first, then those that it inherits
     :raises ValueError: for another type, or a number out of range
     """
     if not _fits(value, declared(name, cls)):
@@ -68,7 +68,7 @@ def check_range(name: str, value: Any) -> None:
 
 
 def check_numbers(where: str, node: Any) -> None:
-    """Look at every number of an argument as plain data, at any depth.
+    """Check every number in an argument's plain data, at any depth.
 
     :raises ValueError: for one that is not finite, or too large for any setting
     """
@@ -79,7 +79,7 @@ def check_numbers(where: str, node: Any) -> None:
             check_numbers(where, item)
         return
     if isinstance(node, str):
-        with contextlib.suppress(ValueError):  # of most texts; SB3 takes numbers as text, too
+        with contextlib.suppress(ValueError):  # most texts are no numbers; SB3 reads those that are
             node = float(node)
     if isinstance(node, int) and abs(node) > _LARGEST:
         raise ValueError(f"{where} holds a number of {node.bit_length()} bits.")
@@ -132,7 +132,7 @@ def no_larger_than(saved: dict[str, Any]) -> Iterator[None]:
 
     :raises SavedFileError: at the first parameter that is too many
     """
-    # Twice and a bit: some modules are built to be replaced. An empty parameter takes time, too.
+    # Twice and a bit, since some modules are built and then replaced. An empty parameter counts too: it takes time.
     left = 2 * sum(tensor.numel() + 1 for tensor in saved.values() if isinstance(tensor, th.Tensor)) + 1000
     thread = threading.get_ident()
 
@@ -152,9 +152,9 @@ def no_larger_than(saved: dict[str, Any]) -> Iterator[None]:
 
 
 def check_tensors(where: str, saved: dict[str, Any], own: dict[str, Any], exact: bool = True) -> None:
-    """Hold tensors against a model's own.
+    """Check tensors against a model's own.
 
-    :param exact: whether none may lack
+    :param exact: whether none may be missing
     :raises SavedFileError: for other names, shapes or types, or numbers that are not finite
     """
     check_names(where, saved, own, exact)
@@ -170,7 +170,7 @@ def check_tensors(where: str, saved: dict[str, Any], own: dict[str, Any], exact:
 
 
 def check_optimizer_state(where: str, saved: dict[int, Any], optimizer: th.optim.Optimizer) -> None:
-    """Hold an optimizer's state against what a step of its own leaves of each parameter.
+    """Check an optimizer's state against what one of its own steps leaves for each parameter.
 
     :raises SavedFileError: for other names, shapes or types, or numbers that are not finite
     """
@@ -179,7 +179,7 @@ def check_optimizer_state(where: str, saved: dict[int, Any], optimizer: th.optim
     twin = copy.deepcopy(optimizer)
     twin.state.clear()
     for group in twin.param_groups:
-        group.setdefault("capturable", False)  # where there is a GPU, a copy of an Adafactor asks for it in vain
+        group.setdefault("capturable", False)  # with a GPU, a copied Adafactor reads this key, which it lacks
         for parameter in group["params"]:
             parameter.grad = th.zeros_like(parameter)
     twin.step()
@@ -197,7 +197,7 @@ def check_optimizer_state(where: str, saved: dict[int, Any], optimizer: th.optim
 
 
 def check_names(where: str, saved: Collection[Any], own: Collection[Any], exact: bool = True) -> None:
-    """:raises SavedFileError: for unknown names and, if exact, where one lacks"""
+    """:raises SavedFileError: for unknown names and, if ``exact``, for missing ones"""
     lacking, unknown = [x for x in own if x not in saved], [x for x in saved if x not in own]
     if unknown or (exact and lacking):
         found = {"lacks": lacking if exact else [], "has unknown": unknown}

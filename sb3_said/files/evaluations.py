@@ -34,7 +34,7 @@ def evaluations_of(callback: BaseCallback | None) -> list[dict[str, Any]]:
 def restore_evaluations(callback: BaseCallback | None, saved: list[dict[str, Any]]) -> None:
     """Give each ``EvalCallback`` what :func:`evaluations_of` returned.
 
-    :raises ValueError: for another number of them, or of their episodes
+    :raises ValueError: for another number of ``EvalCallback``, or of episodes of one evaluation
     :raises SavedFileError: for evaluations other than an EvalCallback's
     """
     eval_callbacks = _eval_callbacks(callback)
@@ -46,7 +46,7 @@ def restore_evaluations(callback: BaseCallback | None, saved: list[dict[str, Any
     for eval_callback, kept in zip(eval_callbacks, saved, strict=True):
         _check_evaluation(kept)
         n_episodes = {np.size(returns) for returns in kept["evaluations_results"]}
-        if n_episodes - {eval_callback.n_eval_episodes}:  # its file, one array of all, could not be written
+        if n_episodes - {eval_callback.n_eval_episodes}:  # EvalCallback could not write all as one array
             raise ValueError(
                 f"the run's evaluations are of {', '.join(map(str, n_episodes))} episodes and it is resumed with "
                 f"{eval_callback.n_eval_episodes}; resume with as many as before"

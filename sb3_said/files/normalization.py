@@ -18,7 +18,7 @@ KIND = "VecNormalize"
 
 
 def normalization_file(agent: Path) -> Path:
-    """Return where the normalisation that an agent reads its observations in is kept, beside its file."""
+    """Return the path of the normalisation of an agent's observations: beside the agent's file."""
     return agent.with_suffix(".normalize.zip")
 
 
@@ -39,7 +39,7 @@ def normalizes_observations(path: Path) -> bool:
 
 
 def load_normalization(path: Path, venv: VecEnv, training: bool = False) -> VecNormalize:
-    """Normalise environments as :func:`save_normalization` was told, running no code from the file.
+    """Normalise environments as a file of :func:`save_normalization` says, running no code from it.
 
     :param training: go on learning the statistics
     :raises SavedFileError: if the file is damaged or forged, or does not fit the environments
@@ -75,7 +75,7 @@ def set_statistics(vec_normalize: VecNormalize | None, saved: dict[str, list[Any
 
 
 def check_statistics(vec_normalize: VecNormalize | None, saved: dict[str, list[Any]]) -> None:
-    """:raises SavedFileError: for statistics of other parts, of other shapes, negative, or that are not finite"""
+    """:raises SavedFileError: for statistics of other parts or shapes, and for negative or not finite ones"""
     parts = _parts(vec_normalize)
     if parts.keys() != saved.keys():
         raise SavedFileError(

@@ -1,4 +1,4 @@
-"""The random states of Python, NumPy and torch, which a run that goes on draws from."""
+"""The random states of Python, NumPy and torch, from which a resumed run draws."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def random_state() -> dict[str, Any]:
 def restore_random_state(state: dict[str, Any]) -> None:
     """Restore what ``random_state`` returned.
 
-    :raises SavedFileError: for a state that NumPy's generator never has, which would crash the process
+    :raises SavedFileError: for a state that no generator has; one of NumPy's would crash the process
     """
     check_random_state(state)
     (version, internal, gauss), (name, keys, *rest) = state["python"], state["numpy"]
@@ -32,13 +32,13 @@ def restore_random_state(state: dict[str, Any]) -> None:
     np.random.set_state((name, keys, *rest))
     th.set_rng_state(state["torch"])
     if "cuda" in state and th.cuda.is_available():
-        th.cuda.set_rng_state_all(state["cuda"][: th.cuda.device_count()])  # the machine before may have had more
+        th.cuda.set_rng_state_all(state["cuda"][: th.cuda.device_count()])  # the machine before may have had more GPUs
 
 
 def check_random_state(state: dict[str, Any]) -> None:
-    """:raises SavedFileError: for states that no generator has; their own checks let some pass"""
+    """:raises SavedFileError: for states that no generator has; the generators' own checks let some pass"""
     version, internal, gauss = state["python"]
-    random.Random().setstate((version, tuple(internal), gauss))  # raises, and no global generator has changed yet
+    random.Random().setstate((version, tuple(internal), gauss))  # raises before any global generator has changed
     name, keys, position, has_gauss, cached = state["numpy"]
     if name != "MT19937" or type(position) is not int or not 0 <= position <= 624:
         raise SavedFileError(f"NumPy's random state is {name!s:.20} at position {position!s:.20}, expected 0..624")

@@ -45,7 +45,7 @@ def agent_state(model: Learner) -> dict[str, Any]:
 
 
 def _plain(name: str, value: Any) -> Any:
-    """Return a counter as a file has it: ``learn(1e6)``, ``learn(inf)`` and NumPy's numbers leave others."""
+    """Return a counter as a file has it, a plain number; ``learn(1e6)``, ``learn(inf)`` and NumPy leave others."""
     value = value.item() if isinstance(value, np.generic) else value
     if name == "_current_progress_remaining" or not isinstance(value, float):
         return value
@@ -89,7 +89,7 @@ def check_counters(model: Learner, saved: dict[str, Any]) -> None:
             fits = type(value) is int and 0 <= value <= LARGEST_COUNT
         elif isinstance(own, float):
             fits = type(value) is float and math.isfinite(value)
-        else:  # ages, where it has learned
+        else:  # trained_ages, None before learning
             fits = value is None or (type(value) is list and all(type(x) is int and 0 <= x < 2**31 for x in value))
         if not fits:
             raise SavedFileError(f"its part 'counters' does not fit: {name} is {value!r:.50}")
@@ -116,7 +116,7 @@ def in_half(value: th.Tensor) -> th.Tensor:
 
 
 def _in_full(state: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
-    """Return tensors that :func:`in_half` wrote in the types of the model's own."""
+    """Return tensors that :func:`in_half` wrote, back in the types of the model's own."""
 
     def full(name: str, value: Any) -> Any:
         is_half = isinstance(value, th.Tensor) and value.dtype == th.float16 and isinstance(own.get(name), th.Tensor)

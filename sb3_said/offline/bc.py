@@ -15,7 +15,7 @@ from sb3_said.sac.policies import DelayedSACPolicy
 
 
 class BCPolicy(DelayedSACPolicy):
-    """Answers with the mean, also where a draw is asked for: how actions spread is not trained."""
+    """Always answers with the mean, since the spread of the actions is not trained."""
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return super()._predict(observation, deterministic=True)
@@ -24,8 +24,8 @@ class BCPolicy(DelayedSACPolicy):
 class BC(OfflineAlgorithm):
     """Imitate the actions of a dataset from what is seen under delay: [observation, action history, age].
 
-    The plainest answer to a delay, and a bar for every other: the actor of ``DelayedSAC``, whose mean learns to be the
-    logged action by least squares. Its critics are not trained, nor how its actions spread: it answers with the mean.
+    The plainest answer to a delay, and the bar for every other. Least squares fit the mean of ``DelayedSAC``'s actor to
+    the logged actions. Neither the critics nor the spread of the actions is trained, so BC answers with the mean.
 
     :param policy: ``"MultiInputPolicy"`` or ``"MlpPolicy"``, which name the same class
     :param env: a task in a ``DelayedObservationWrapper``, or one with a 1-D Box observation (delay 0)
@@ -52,9 +52,9 @@ class BC(OfflineAlgorithm):
         return {**super()._policy_flags(), "normalise_states": self.normalise_states}
 
     def take_dataset(self, dataset: Any, progress_bar: bool = False) -> None:
-        """Replace the replay buffer by a dataset, as every offline algorithm does, and look at its states.
+        """Replace the replay buffer by a dataset, and fit the scale of states to it.
 
-        The scale of states stays what it was once weights have learned with it.
+        Once weights have learned with a scale, that scale stays.
         """
         super().take_dataset(dataset, progress_bar)
         if self.policy.state_normalizer is not None and self._n_updates == 0:

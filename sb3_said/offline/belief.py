@@ -21,7 +21,7 @@ Observation = dict[str, np.ndarray]
 
 
 class Belief(Protocol):
-    """Says in which state a task now is."""
+    """Tells which state a task is in now."""
 
     max_delay: int
 
@@ -44,10 +44,10 @@ class PlannerBelief:
 
     def __init__(self, planner: InpaintingPlanner, which: str = "inpainted"):
         self.planner, self.max_delay = copy.copy(planner), planner.max_delay  # the same weights, other settings
-        self.planner.config = replace(planner.config, present=which, decided_by="plan")  # it decides nothing
+        self.planner.config = replace(planner.config, present=which, decided_by="plan")  # this copy decides nothing
 
     def present(self, state: th.Tensor, action_history: th.Tensor, delay: th.Tensor) -> th.Tensor:
-        """Return the one present that no initial noise leads to, or that is guessed: (B, obs_dim)."""
+        """Return the present, decoded at temperature 0 or guessed: (B, obs_dim)."""
         if self.planner.config.present == "guessed":
             return self.planner.guess(state, action_history, delay)[0]
         return self.planner.plan(state, action_history, delay, temperature=0.0).present
@@ -66,20 +66,20 @@ class LearnedBelief(ZScored):
         self.max_delay = max_delay
 
     def fit_scale(self, source: WindowSource) -> None:
-        """Take over how states are spread."""
+        """Fit the scale of states to the source's."""
         self.scale_to(source.start_states().to(self.mean.device))
 
     def loss(self, windows: Windows, generator: th.Generator) -> th.Tensor:
         """Return the mean squared error of z-scored states.
 
         :param windows: B windows of D + 1 steps
-        :param generator: of what is drawn beside them
+        :param generator: draws what else is random
         """
         raise NotImplementedError
 
 
 class RolledOutModel(LearnedBelief):
-    """A model of one step, (s, a) to s', which is rolled out over the actions since: its errors compound."""
+    """A model of one step, (s, a) to s', rolled out over the actions sent since. Its errors compound."""
 
     learning_rate = OneStepModel.learning_rate
 
@@ -88,14 +88,14 @@ class RolledOutModel(LearnedBelief):
         self.model = OneStepModel(obs_dim, act_dim)
 
     def fit_scale(self, source: WindowSource) -> None:
-        """Take over how states and their moves are spread, so that small moves count as much as large ones."""
+        """Fit the scales of states and of their moves, so that small moves count as much as large ones."""
         super().fit_scale(source)
         steps = source.gather(th.arange(len(source), device=source.rows.device), 2).to(self.mean.device)
         moves = self._z(steps.states)[steps.valid[:, 1]].diff(dim=1)[:, 0].abs().median(0).values
         self.model.move_std.copy_(th.where(moves > 1e-6, moves, 1.0))
 
     def present(self, state: th.Tensor, action_history: th.Tensor, delay: th.Tensor) -> th.Tensor:
-        """Take one step for each action sent since: (B, obs_dim)."""
+        """Return s_t, after one step of the model for each action sent since: (B, obs_dim)."""
         z = self._z(state)
         for k in range(self.max_delay):
             is_since = (self.max_delay - k <= delay)[:, None]  # a_{t-D+k} came after s_{t-d}
@@ -103,12 +103,12 @@ class RolledOutModel(LearnedBelief):
         return z * self.std + self.mean
 
     def loss(self, windows: Windows, generator: th.Generator) -> th.Tensor:
-        """Return the model's loss of one step; a window gives its first."""
+        """Return the model's loss on the first step of each window."""
         return self.model.loss(self._z(windows.states[:, :2]), windows.actions[:, :1], windows.valid[:, 1:2])
 
 
 class RegressedPresent(LearnedBelief):
-    """A plain regression from the old state and the actions since to the present.
+    """A plain regression from s_{t-d} and the actions sent since to s_t.
 
     :param hidden: width of the two hidden layers
     """
@@ -118,12 +118,12 @@ class RegressedPresent(LearnedBelief):
         self.net = RegressionYardstick(obs_dim, act_dim, max_delay, hidden)
 
     def present(self, state: th.Tensor, action_history: th.Tensor, delay: th.Tensor) -> th.Tensor:
-        """Ask the network once: (B, obs_dim)."""
+        """Return s_t, from one pass of the network: (B, obs_dim)."""
         since = newest(action_history, delay, self.max_delay)
         return self.net(self._z(state), since, delay)[0] * self.std + self.mean
 
     def loss(self, windows: Windows, generator: th.Generator) -> th.Tensor:
-        """Return the error at random ages."""
+        """Return the error at ages drawn at random."""
         delay = th.randint(self.max_delay + 1, (len(windows.states),), generator=generator).to(windows.states.device)
         rows = th.arange(len(delay), device=delay.device)
         present, _ = self.net(self._z(windows.states[:, 0]), windows.actions, delay)
@@ -139,7 +139,7 @@ def train_belief(
     seed: int = 0,
     progress_bar: bool = False,
 ) -> None:
-    """Train a belief with Adam, whose rate falls from the belief's own to 0 by a cosine.
+    """Train a belief with Adam; its learning rate falls by a cosine from the belief's own to 0.
 
     :param belief: to train, on its own device
     :param source: windows of true states, such as ``model.replay_buffer.window_source()``
@@ -148,7 +148,7 @@ def train_belief(
     """
     device, generator = belief.mean.device, th.Generator().manual_seed(seed)
     belief.fit_scale(source)
-    length = max(belief.max_delay, 1) + 1  # a model takes a step
+    length = max(belief.max_delay, 1) + 1  # a model of one step needs two states
 
     def loss() -> th.Tensor:
         return belief.loss(source.sample(batch_size, length, generator).to(device), generator)
@@ -162,7 +162,7 @@ def belief_error(belief: Belief, windows: Windows, delay: int) -> float:
 
     :param windows: held out from training, of at least delay + 1 steps
     :param delay: d, the same for all
-    :raises ValueError: when no episode is so long
+    :raises ValueError: when no window has delay + 1 steps of one episode
     """
     reach = windows.valid[:, delay]
     if not reach.any():
@@ -178,7 +178,7 @@ def belief_error(belief: Belief, windows: Windows, delay: int) -> float:
 class BeliefOnly:
     """A policy without delay that acts on a belief of the present; it has SB3's ``predict``.
 
-    :param belief: says where the task is
+    :param belief: tells the present state
     :param actor: anything with SB3's ``predict`` and ``observation_space``: an agent of a task without delay, or one of
         ours under delay, which is shown the believed state at age 0
     :param device: of the belief
@@ -197,7 +197,7 @@ class BeliefOnly:
 
     @th.no_grad()
     def present(self, observation: Observation) -> np.ndarray:
-        """Return what the belief makes of batched observations: (B, obs_dim).
+        """Return the believed s_t of batched observations: (B, obs_dim).
 
         :raises ValueError: for an action history of another length than the belief's largest delay
         """
@@ -220,14 +220,14 @@ class BeliefOnly:
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Answer one delayed observation or a batch of them as the actor answers the believed present."""
+        """Let the actor answer the believed present of one delayed observation, or of each in a batch."""
         is_batch = np.ndim(observation["delay"]) == 2
         batch = observation if is_batch else {key: np.asarray(value)[None] for key, value in observation.items()}
         present: Any = self.present(batch)
-        if self.age_0_spaces is not None:  # no action was sent since, and no other state is known
+        if self.age_0_spaces is not None:  # at age 0 no action was sent since, and no other state is read
             seen = {key: np.zeros((len(present), *box.shape), np.float32) for key, box in self.age_0_spaces.items()}
-            history, shown = np.asarray(batch["action_history"]), seen["action_history"]  # zeros begin an episode
-            n = min(history.shape[1], shown.shape[1])
+            history, shown = np.asarray(batch["action_history"]), seen["action_history"]
+            n = min(history.shape[1], shown.shape[1])  # actions stay: zeros would mean the start of an episode
             shown[:, shown.shape[1] - n :] = history[:, history.shape[1] - n :]
             present = {"observation": present, **seen}
         action, state = self.actor.predict(present, state, episode_start, deterministic)

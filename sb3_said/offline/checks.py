@@ -11,19 +11,19 @@ from gymnasium import spaces
 
 from sb3_said.delays.space import center_and_half, scale_action
 
-ACTION_TOLERANCE = 1e-3  # of half the range: what float32 and a tanh leave beyond the bounds
+ACTION_TOLERANCE = 1e-3  # of half the range: rounding in float32 or a tanh may exceed the bounds by so much
 
 #: observations, actions, rewards, terminated, ends and next_observations of N rows
 Columns = dict[str, np.ndarray]
 
 
 def check_task(name: str, given: str | None, changes: str, env_id: str | None) -> None:
-    """Refuse data of another task, and warn of another version of it, or of one that was changed.
+    """Refuse data of another task; warn of data of another version of the task, or of a changed one.
 
-    :param given: id of the task that the data is of, None where it does not say
-    :param changes: how that task was changed, empty where it was not
+    :param given: id of the data's task, None where the data does not say
+    :param changes: how the data's task was changed, empty where it was not
     :param env_id: id of the task to learn, None where it has none
-    :raises ValueError: naming both
+    :raises ValueError: for another task; the message names both
     """
     if changes:
         warnings.warn(f"{name} is of a task changed by {changes}: learn for one that is changed alike.", stacklevel=3)
@@ -45,7 +45,7 @@ def check_lengths(name: str, columns: Mapping[str, np.ndarray]) -> None:
 def flags(name: str, key: str, values: Any) -> np.ndarray:
     """Return a column of flags: (N,) bool.
 
-    :raises ValueError: for several numbers in a row, and for others than 0 and 1, such as NaN; it names the row
+    :raises ValueError: for rows of several numbers; for a number other than 0 and 1, such as NaN, naming its row
     """
     column = _one_a_row(name, key, values)
     _refuse(name, (column != 0) & (column != 1), f"{key} must be 0 or 1", column)
@@ -53,11 +53,11 @@ def flags(name: str, key: str, values: Any) -> np.ndarray:
 
 
 def checked(name: str, columns: Columns, state_space: spaces.Box, box: spaces.Box) -> dict[str, np.ndarray]:
-    """Return what a ``Dataset`` is made of, actions scaled.
+    """Return the columns of a ``Dataset``, with actions scaled to [-1, 1].
 
     :param name: of the source, for errors
     :param box: space of the actions as the log has them
-    :raises ValueError: for what is no log of the task; it names the row
+    :raises ValueError: for what is no log of the task; if one row is at fault, the message names it
     """
     columns = {**columns, "rewards": _one_a_row(name, "rewards", columns["rewards"])}
     shapes = {"observations": state_space.shape, "actions": box.shape, "rewards": ()}
@@ -69,7 +69,7 @@ def checked(name: str, columns: Columns, state_space: spaces.Box, box: spaces.Bo
             raise ValueError(
                 f"{name} has {key} of shape {values.shape[1:]}, and the task {expected}: it is of another task."
             )
-        with np.errstate(over="ignore"):  # refused with a reason next
+        with np.errstate(over="ignore"):  # the check below refuses it with a reason
             floats[key] = np.asarray(values, np.float32)
         is_finite = np.isfinite(floats[key]).reshape(len(values), -1).all(axis=1)
         _refuse(name, ~is_finite, f"{key} must be finite", values)
@@ -92,13 +92,13 @@ def checked(name: str, columns: Columns, state_space: spaces.Box, box: spaces.Bo
 
 
 def continues(states: np.ndarray, next_states: np.ndarray) -> np.ndarray:
-    """Tell which rows but the first hold the state that the step before led to: (N - 1,) bool."""
+    """Tell, for each row but the first, whether the row before led to its state: (N - 1,) bool."""
     is_close = np.isclose(next_states[:-1], states[1:], rtol=1e-3, atol=1e-3)
     return is_close.all(axis=tuple(range(1, is_close.ndim)))
 
 
 def numbers(name: str, key: str, values: Any) -> np.ndarray:
-    """:raises ValueError: for a column of something else"""
+    """:raises ValueError: for a column that holds no numbers"""
     column = np.asarray(values)
     if column.dtype.kind not in "biuf":
         raise ValueError(f"{name} has {key} of type {column.dtype}, expected numbers.")
@@ -114,7 +114,7 @@ def _one_a_row(name: str, key: str, values: Any) -> np.ndarray:
 
 
 def _refuse(name: str, bad: Any, why: str, values: np.ndarray) -> None:
-    """:raises ValueError: where a row is bad; it names the first, and how many there are"""
+    """:raises ValueError: if any row is bad; the message names the first, and counts them"""
     if (rows := np.flatnonzero(bad)).size:
         more = f" ({rows.size} rows like this)" if rows.size > 1 else ""
         raise ValueError(f"Row {rows[0]} of {name}: {why}, got {values[rows[0]]}{more}.")

@@ -22,8 +22,8 @@ from sb3_said.replay.buffer import DelayedReplayBuffer, rows_for_logs
 class Dataset:
     """Trajectories of a task without delay, laid end to end.
 
-    A trajectory's end and a terminal state are two things: after a time limit, or where the log was cut, the last state
-    still has a value. ``finals`` keeps it.
+    The end of a trajectory need not be terminal: after a time limit, or where the log was cut, the state that follows
+    the last step still has a value. ``finals`` keeps that state.
 
     :param states: (N, obs_dim) float32, before each action
     :param actions: (N, act_dim) float32, scaled to [-1, 1]
@@ -103,7 +103,7 @@ class Dataset:
             "timeouts": (self.ends & ~self.terminated).astype(np.float32),
             "ages": ages,
             "steps": (np.arange(len(self)) - np.repeat(ends + 1 - lengths, lengths)).astype(np.int32),
-            "ends": np.append(self.ends[:-1], False),  # the newest row's tail is what follows the buffer
+            "ends": np.append(self.ends[:-1], False),  # what follows the newest row is no tail, but in next_states
         }
         state = {name: column[:, None] for name, column in rows.items()} | {
             "holds_logs": True,
@@ -135,11 +135,11 @@ def load_dataset(
         joined
     :param observation_space: of the task, with or without ``DelayedObservationWrapper``
     :param action_space: of the task
-    :param env_id: refuse a dataset that says it is of another task; one of another version, or of a changed task, warns
+    :param env_id: id of the task; data of another task is refused, data of another version or a changed task warned of
     :param progress_bar: show one, where reading takes long
     :raises ValueError: for what is no dataset, a damaged file, data of other shapes or another task, actions outside
         the bounds, entries that are NaN or infinite, flags other than 0 and 1, and steps that do not follow each other.
-        It names the file and the row
+        The message names the file and the row
     :raises FileNotFoundError: where there is no such file
     """
     state_space, action_space, _ = check_spaces(observation_space, action_space)
@@ -158,7 +158,7 @@ def load_dataset(
 
 
 def is_file(source: Any) -> bool:
-    """Tell whether a dataset is meant as the path of a file, by its suffix; other text is an id of Minari."""
+    """Tell by its suffix whether a source is the path of a file; any other text is the id of a Minari dataset."""
     return isinstance(source, (str, os.PathLike)) and Path(source).suffix in (".hdf5", ".h5", ".npz")
 
 
@@ -179,7 +179,7 @@ def _read(source: Any, progress_bar: bool) -> Log:
 
 
 def _of_dataset(name: str, data: Dataset) -> Columns:
-    """Return the columns of a dataset that its user may have made."""
+    """Return the columns of a dataset, checked, since a user may have made it."""
     columns = {field.name: np.asarray(getattr(data, field.name)) for field in fields(Dataset)}
     finals = columns.pop("finals")
     check_lengths(name, columns)

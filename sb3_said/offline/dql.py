@@ -1,4 +1,4 @@
-"""Diffusion Q-learning (Wang et al., ICLR 2023, https://arxiv.org/abs/2208.06193), and with state augmentation."""
+"""Diffusion Q-learning (Wang et al., ICLR 2023, https://arxiv.org/abs/2208.06193), also with state augmentation."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ class DQLConfig:
     time_embedding: int = 16
     """entries that tell the denoising step (code)"""
     eta: float = 1.0
-    """weight of the Q loss beside that of the data (paper, Table 4: 1.0 for all MuJoCo tasks)"""
+    """weight of the Q loss; that of the imitation loss is 1 (paper, Table 4: 1.0 for all MuJoCo tasks)"""
     n_candidates: int = 50
     """actions drawn for a decision; one is taken with probability softmax(Q) (code, ``sample_action``)"""
     max_grad_norm: float | None = 9.0
-    """of actor and critics (paper, Table 4: 1 to 9, by task and dataset; 9.0 for hopper-medium); None clips nothing"""
+    """of actor and critics (paper, Table 4: 1 to 9, by task and dataset; 9.0 for hopper-medium); None: no clipping"""
     ema_decay: float = 0.995
     ema_start: int = 1000
     ema_every: int = 5
-    """in gradient steps, of the average that gives the actions of Q's targets; before its start, the first weights do
-    (code)"""
+    """of the averaged actor, which gives the actions in Q's targets; start and interval in gradient steps. Before the
+    start, the initial weights give them (code)"""
 
     def __post_init__(self) -> None:
         low = {"denoising_steps": 1, "hidden": 1, "time_embedding": 4, "eta": 0, "n_candidates": 1, "ema_every": 1}
@@ -90,7 +90,7 @@ class DiffusionActor(Actor):
     frequencies: th.Tensor
 
     def noise_of(self, features: th.Tensor, action: th.Tensor, step: th.Tensor) -> th.Tensor:
-        """Return the noise that the network sees in noised actions: (B, act_dim).
+        """Return the noise that the network predicts in noised actions: (B, act_dim).
 
         :param features: (B, features_dim)
         :param action: (B, act_dim) a^i
@@ -101,7 +101,7 @@ class DiffusionActor(Actor):
         return self.noise_net(th.cat([action, time, features], dim=1))
 
     def imitation_loss(self, obs: PyTorchObs, action: th.Tensor) -> th.Tensor:
-        """Return the mean squared error of the noise in noised actions of the data (equation 2).
+        """Return the mean squared error of the noise predicted in the data's noised actions (equation 2).
 
         :param action: (B, act_dim), in [-1, 1]
         """
@@ -195,7 +195,7 @@ class DQLPolicy(DelayedSACPolicy):
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         if not deterministic:
             return self.decide(observation)
-        # Each row alone: what it answers does not depend on the batch, and the observation decides the draws.
+        # Row by row, so that no answer depends on the batch; the observation seeds its own draws.
         generators = (th.Generator().manual_seed(seed_of(row)) for row in rows_of(observation))
         return th.cat([self.decide(*pair) for pair in zip(rows_of(observation), generators, strict=True)])
 
@@ -218,17 +218,18 @@ class DQL(OfflineAlgorithm):
     """Diffusion Q-learning: a diffusion policy imitates the data and, weighed by eta, climbs Q.
 
     Under delay, actor and critics read [observation, action history, age] (DQL+SA, the baseline of the SAID paper);
-    ``augment_state=False`` is DQL as it is, on old observations. With ``delay_reconciled_critic=True`` the critics read
-    the true states, which the logs have: Q is sharper, but cannot choose among candidates in play, so one is drawn.
+    ``augment_state=False`` is DQL as published, on old observations. With ``delay_reconciled_critic=True`` the critics
+    read the true states, which the logs have. Q is sharper then, but cannot choose in play, so one candidate is drawn.
 
     :param policy: ``"MultiInputPolicy"`` or ``"MlpPolicy"``, which name the same class
     :param env: a task in a ``DelayedObservationWrapper``, or one with a 1-D Box observation (delay 0)
     :param learning_rate: of actor and critics (paper: 3e-4)
-    :param lr_decay: let it fall to 0 by a cosine over the training, as CleanDiffuser's DQL does. The paper's commands
-        have ``--lr_decay``, too, but its code makes 40 of the schedule's 2,000 steps: the rate loses 0.1 %
+    :param lr_decay: let the learning rate fall to 0 by a cosine over the training, as CleanDiffuser's DQL does. The
+        paper's commands have ``--lr_decay``, too, but its code makes only 40 of the schedule's 2,000 steps, by which
+        the rate loses 0.1 %
     :param diffusion_kwargs: fields of :class:`DQLConfig`
     :param sac_kwargs: every other argument of :class:`~sb3_said.sac.DelayedSAC`; batch size 256, gamma 0.99 and tau
-        0.005 are the paper's. Those of entropy and ``target_update_interval`` have no effect
+        0.005 are the paper's. The arguments of entropy and ``target_update_interval`` have no effect
     :raises ValueError: as ``DelayedSAC`` does, and for gSDE, other than two critics, or a ``net_arch`` of the actor
     """
 
@@ -288,7 +289,7 @@ class DQL(OfflineAlgorithm):
                 start=target_q.new_zeros(()),
             )
             self._descend(self.critic, critic_loss)
-            # Actor (equation 3): a randomly chosen critic, scaled by the other's size
+            # Actor (equation 3): Q of a randomly chosen critic, over the mean |Q| of the other
             imitation_loss = self.actor.imitation_loss(batch.observations, batch.actions)
             first, second = self.critic(batch.observations, self.actor.sample(batch.observations))
             if np.random.random() < 0.5:
@@ -328,5 +329,5 @@ class DQL(OfflineAlgorithm):
 
 
 def _falling(rate: Callable[[float], float], remaining: float) -> float:
-    """Return a rate times a cosine's fall from 1 to 0; no lambda, which could not be pickled."""
+    """Return a rate times a cosine that falls from 1 to 0. It is no lambda, since that could not be pickled."""
     return rate(remaining) * 0.5 * (1.0 - math.cos(math.pi * remaining))

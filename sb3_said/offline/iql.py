@@ -16,7 +16,7 @@ from sb3_said.offline.datasets import Dataset
 from sb3_said.planner.checks import check_same, check_settings
 from sb3_said.planner.plain import ZScored
 
-SMALLEST_SPREAD = 0.1  # of returns, in the size of the largest: else a log of equal ones would be scaled without end
+SMALLEST_SPREAD = 0.1  # of returns, as a part of the largest: nearly equal returns would be scaled up without bound
 
 
 class Transitions(NamedTuple):
@@ -31,7 +31,7 @@ class Transitions(NamedTuple):
 
 @dataclass(frozen=True)
 class IQLConfig:
-    """Settings of the values; their sources in parentheses."""
+    """Settings of the values, with their sources in parentheses."""
 
     expectile: float = 0.7
     """tau of the expectile regression, in [0.5, 1); 0.5 is the mean (SAID paper, Table 3: iql_tau)"""
@@ -40,11 +40,11 @@ class IQLConfig:
     learning_rate: float = 3e-4
     """of Adam, for V and Q (IQL, CleanDiffuser)"""
     target_rate: float = 0.005
-    """part by which target critics move to the critics (IQL, CleanDiffuser: 0.995 kept)"""
+    """part of the way that target critics move to the critics (IQL; CleanDiffuser keeps 0.995)"""
     batch_size: int = 256
     """steps of an update (IQL, SAID paper)"""
     updates: int = 2
-    """for each of the planner's (ours: the planner has few where it learns within hours; the paper has one)"""
+    """of V and Q for each update of the planner (ours: a planner that learns within hours has few; the paper's: one)"""
 
     def __post_init__(self) -> None:
         check_settings(self, {"hidden": 1, "batch_size": 1, "updates": 1})
@@ -58,10 +58,10 @@ class IQLConfig:
 
 
 class ImplicitValues(ZScored):
-    """V(s), and the Q(s, a) it is learned from, without asking about an action that is not in the data.
+    """V(s), and the Q(s, a) from which V is learned, without asking about an action that is not in the data.
 
-    V is the expectile of Q over the data's actions: with tau near 1, that of the best of them. Inputs are z-scored and
-    rewards scaled by :meth:`fit`; values are in the environment's units.
+    V is the expectile of Q over the data's actions: with tau near 1, Q of the best of them. :meth:`fit` sets the scales
+    of states and rewards; :meth:`value` is in the environment's units.
 
     :param obs_dim: entries of a state
     :param act_dim: entries of an action
@@ -80,19 +80,19 @@ class ImplicitValues(ZScored):
 
     @th.no_grad()
     def fit(self, states: th.Tensor, returns: th.Tensor, longest: int) -> None:
-        """Take over how states and trajectory returns are spread.
+        """Fit the scales of states and rewards.
 
         :param states: (M, obs_dim)
         :param returns: (n_trajectories,)
         :param longest: T, steps of the longest trajectory. Rewards are multiplied by T / (largest - smallest return),
-            which is IQL's 1000 / (...) on MuJoCo; the difference counts as a tenth of the largest return at least
+            on MuJoCo IQL's 1000 / (...). The difference counts as at least a tenth of the largest absolute return
         """
         self.scale_to(states)
         spread = th.maximum(returns.max() - returns.min(), SMALLEST_SPREAD * returns.abs().max())
         self.scale.copy_(longest / spread if spread > 0 else th.ones(()))
 
     def value(self, states: th.Tensor) -> th.Tensor:
-        """Return V(s) as the environment's rewards would sum up.
+        """Return V(s) in units of the environment's rewards.
 
         :param states: (..., obs_dim)
         :return: (...)
@@ -136,7 +136,7 @@ class IQL:
         self.generator = th.Generator().manual_seed(seed)
 
     def step(self) -> dict[str, th.Tensor]:
-        """Make one step of gradient descent on a batch of all steps alike, and move the target critics.
+        """Make a gradient step on a batch drawn uniformly from all steps, then move the target critics.
 
         :return: both losses
         """
@@ -150,7 +150,7 @@ class IQL:
         return losses
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that goes on with the training needs, but the data."""
+        """Return all that a resumed training needs, but the data."""
         return {
             "config": asdict(self.values.config),
             "values": self.values.state_dict(),
@@ -159,9 +159,9 @@ class IQL:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from what :meth:`state_dict` returned.
+        """Resume from what :meth:`state_dict` returned.
 
-        :raises ValueError: when that training had other settings, so that the end would be neither's
+        :raises ValueError: when the saved training had other settings
         """
         advice = "Give the old iql_kwargs, or start a new training."
         check_same("V(s) was learned", state["config"], asdict(self.values.config), advice)
@@ -171,7 +171,7 @@ class IQL:
 
 
 def expectile_loss(difference: th.Tensor, expectile: float) -> th.Tensor:
-    """Return the mean of |tau - 1(u < 0)| u^2, whose minimum over V of u = Q - V is the tau-expectile of Q.
+    """Return the mean of |tau - 1(u < 0)| u^2. With u = Q - V, the tau-expectile of Q is the V that minimises it.
 
     :param difference: (B,) u
     :param expectile: tau

@@ -25,7 +25,7 @@ SelfOffline = TypeVar("SelfOffline", bound="OfflineAlgorithm")
 
 
 class GradientStepBar(ProgressBarCallback):
-    """SB3's progress bar, which counts the steps of environments, for gradient steps."""
+    """SB3's progress bar, counting gradient steps instead of environment steps."""
 
     def _on_step(self) -> bool:
         self.pbar.update()
@@ -42,9 +42,9 @@ class OfflineAlgorithm(DelayedSAC):
     learns_online: ClassVar[bool] = False
 
     def learn(self: SelfOffline, *args: Any, **kwargs: Any) -> SelfOffline:
-        """Learn from the environment, where the subclass does.
+        """Learn from the environment, if the subclass can.
 
-        :raises ValueError: where it learns from logs alone
+        :raises ValueError: if the subclass learns from logs alone
         """
         if not self.learns_online:
             raise ValueError(
@@ -56,8 +56,8 @@ class OfflineAlgorithm(DelayedSAC):
                 "The agent collects steps of its own now: its replay no longer holds the dataset.", stacklevel=3
             )
             self.replay_buffer = self._new_replay_buffer()
-            self.num_timesteps = 0  # counted updates of learn_offline
-        elif self.trained_ages is None and self.replay_buffer.size() == 0:  # as of one that was saved since
+            self.num_timesteps = 0  # it counted updates of learn_offline
+        elif self.trained_ages is None and self.replay_buffer.size() == 0:  # loaded: a file has no replay
             self.num_timesteps = 0
         return super().learn(*args, **kwargs)
 
@@ -73,17 +73,17 @@ class OfflineAlgorithm(DelayedSAC):
     ) -> SelfOffline:
         """Learn from a dataset. ``num_timesteps`` counts gradient steps, and callbacks are called after each.
 
-        To them each gradient step is a rollout of one step, so that a ``TrainingCheckpointCallback`` works as online.
+        Callbacks see each gradient step as a rollout of one step, so a ``TrainingCheckpointCallback`` works as online.
 
         :param dataset: whatever :func:`~sb3_said.offline.load_dataset` reads; None for what :meth:`take_dataset` took
         :param gradient_steps: to make
         :param callback: SB3 callbacks, such as ``EvalCallback``
-        :param log_interval: gradient steps between two rows of the log, the last of which is at the end; None for none
+        :param log_interval: gradient steps between two rows of the log, with a last row at the end; None for no log
         :param tb_log_name: name of the run in TensorBoard, the class's by default
         :param reset_num_timesteps: count from 0
         :param progress_bar: show one
-        :raises ValueError: as ``load_dataset`` does, for no count, and without the wrapper that gives a delayed agent
-            its ages
+        :raises ValueError: as ``load_dataset`` does; for steps that are no count; for a delayed agent without the
+            wrapper that gives its ages
         """
         check_intervals(log_interval=log_interval)
         if isinstance(self.observation_space, spaces.Dict) and self._draw_ages() is None:
@@ -105,7 +105,7 @@ class OfflineAlgorithm(DelayedSAC):
             if not self._goes_on(watcher):
                 break
             watcher.on_rollout_end()
-        if log_interval is not None and self.logger.name_to_value:  # since the last row
+        if log_interval is not None and self.logger.name_to_value:  # recorded since the last row
             self.logger.dump(self.num_timesteps)
         watcher.on_training_end()
         return self
@@ -119,7 +119,7 @@ class OfflineAlgorithm(DelayedSAC):
         reset_num_timesteps: bool,
         progress_bar: bool,
     ) -> BaseCallback:
-        """Do what SB3's ``_setup_learn`` does, but for the environment; return the callbacks, not yet started."""
+        """Do what SB3's ``_setup_learn`` does, without an environment; return the callbacks, not yet started."""
         gradient_steps = whole("gradient_steps", gradient_steps, least=0)
         if dataset is not None:
             self.take_dataset(dataset, progress_bar)
@@ -140,9 +140,9 @@ class OfflineAlgorithm(DelayedSAC):
         return watcher.on_step()
 
     def take_dataset(self, dataset: Any, progress_bar: bool = False) -> None:
-        """Replace the replay buffer by a dataset, whose episodes are seen at the ages that this agent's delay gives.
+        """Replace the replay buffer by a dataset, at ages drawn as the environment's delay would give them.
 
-        A ``VecNormalize`` that learns takes the mean and variance of observations and the size of returns from it.
+        A ``VecNormalize`` in training takes mean and variance of observations and the size of returns from the dataset.
 
         :param dataset: whatever :func:`~sb3_said.offline.load_dataset` reads
         :param progress_bar: show one
@@ -162,11 +162,11 @@ class OfflineAlgorithm(DelayedSAC):
         )
 
     def _draw_ages(self) -> Callable[[int], np.ndarray] | None:
-        """Return how to draw the ages of an episode, as its environment's receiver and actuator do in play."""
+        """Return a function that draws an episode's ages as its receivers would in play; None without the wrapper."""
         is_delayed = isinstance(self.observation_space, spaces.Dict)
         if self.env is None or not is_delayed or not has_attribute(self.env, "make_receivers"):
             return None
-        made = self.env.env_method("make_receivers")  # of environments whose delays may differ
+        made = self.env.env_method("make_receivers")  # one for each environment; their delays may differ
         rng = np.random.default_rng(self.seed)
 
         def step(receiver: NewestPacket, actuator: Actuator | None) -> int:
@@ -186,7 +186,7 @@ class OfflineAlgorithm(DelayedSAC):
 
 
 def take_statistics(vec_normalize: VecNormalize, data: Dataset) -> None:
-    """Let a ``VecNormalize`` learn from logged episodes what it would have in play, one after the other."""
+    """Update a ``VecNormalize`` as if it had seen the logged episodes in play, one after the other."""
     if vec_normalize.norm_obs:
         rms = vec_normalize.obs_rms
         (rms["observation"] if isinstance(rms, dict) else rms).update(data.states.astype(np.float64))

@@ -16,7 +16,7 @@ REFERENCE_RETURNS = {
 def reference_returns(env_id: str) -> tuple[float, float] | None:
     """Return D4RL's (random, expert) returns of a task, None where D4RL has none.
 
-    They were measured on the tasks of mujoco-py; scores on ``-v5`` tasks are comparable among each other.
+    They were measured on the tasks of mujoco-py, so compare scores on ``-v5`` tasks only with each other.
 
     :param env_id: such as ``"Hopper-v5"``
     """

@@ -26,31 +26,31 @@ COLUMNS = {
     "truncated": ("timeouts", "truncations", "truncated"),
     "next_observations": ("next_observations", "next_states", "next_obs"),
 }
-TASK = "env"  # entry of an .npz, entry or attribute of an HDF5 file: id of the task, where it says
-ABOUT = "about"  # entry of an .npz: what collect tells of it, in JSON
+TASK = "env"  # entry of an .npz, entry or attribute of an HDF5 file: id of the task, if it is told
+ABOUT = "about"  # entry of an .npz: what collect tells about the data, in JSON
 MINARI = 'pip install "sb3_said[offline]"' if sys.version_info >= (3, 11) else "it needs Python 3.11, an .npz does not"
 READ = {TASK, ABOUT, *(name for names in COLUMNS.values() for name in names)}
 
 
 class Log(NamedTuple):
-    """What was found in one place."""
+    """What one source holds."""
 
     name: str
     task: str | None
-    """id of the task that it is of, where it says"""
+    """id of the log's task; None where the source does not tell it"""
     changes: str
     """how that task was changed, in JSON; empty where it was not, or where nothing says so"""
     parts: list[tuple[str, Columns]]
-    """each with its name, for errors"""
+    """columns of each part, with its name for errors"""
     is_scaled: bool = False
-    """whether its actions are in [-1, 1], and not in the task's units"""
+    """whether actions are in [-1, 1] instead of the task's units"""
 
 
 def read_file(path: Path, progress_bar: bool) -> Log:
     """Read an ``.npz`` or HDF5 file.
 
     :param progress_bar: show one over the columns, where they take more than a second
-    :raises FileNotFoundError: where there is none
+    :raises FileNotFoundError: where there is no such file
     :raises ValueError: for a damaged file, or one without a column that is needed
     """
     if not path.exists():
@@ -63,7 +63,7 @@ def read_file(path: Path, progress_bar: bool) -> Log:
 
     def read(file: Any, names: Iterable[str]) -> dict[str, Any]:
         bar = tqdm(names, desc=path.name, unit="column", disable=not progress_bar, delay=1.0)
-        return {name: file[name][()] if name in READ else None for name in bar}  # errors name the others
+        return {name: file[name][()] if name in READ else None for name in bar}  # the others' names are for errors
 
     try:
         if path.suffix == ".npz":
@@ -84,7 +84,7 @@ def read_file(path: Path, progress_bar: bool) -> Log:
 
 
 def _changes(about: Any) -> str:
-    """Return what collect tells of changes to a task; other descriptions tell nothing of them."""
+    """Return the changes to the task that collect has noted, in JSON; other descriptions note none."""
     try:
         found = json.loads(str(about))["changes"]
     except (ValueError, TypeError, KeyError):
@@ -95,9 +95,9 @@ def _changes(about: Any) -> str:
 def _of_columns(name: str, given: Mapping[str, Any]) -> Columns:
     """Return the columns under our names, with the trajectories' ends.
 
-    Without next observations, the state after a time limit is unknown: that step's state ends the trajectory instead.
-    The state after a terminal step is unknown, too, and nothing is learned from it; its own stands in its place.
-    With them, files need not say where episodes were cut off, as those of ``d4rl.qlearning_dataset`` do not.
+    Without next observations, the state after a cut-off step is unknown: the step is left out, and its own state is the
+    final one. The state after a terminal step is unknown, too, but never learned from: the step's own state fills in.
+    With next observations, a file need not say where episodes were cut off; ``d4rl.qlearning_dataset`` does not.
     """
     found = {ours: next((n for n in names if n in given), None) for ours, names in COLUMNS.items()}
     not_needed = {"next_observations"} if found["next_observations"] is None else {"truncated"}
@@ -125,17 +125,17 @@ def _of_columns(name: str, given: Mapping[str, Any]) -> Columns:
         after[columns["ends"]] = states[columns["ends"]]
         columns["next_observations"] = after
         unknown = columns["ends"] & ~columns["terminated"]
-        columns["ends"] |= np.append(unknown[1:], False)  # where it was the only step, nothing is left of it
+        columns["ends"] |= np.append(unknown[1:], False)  # a trajectory of this one step vanishes
         columns = {key: value[~unknown] for key, value in columns.items()}
     return columns
 
 
 def read_buffer(buffer: ReplayBuffer) -> Log:
-    """Read a replay buffer: of each parallel environment, oldest step first.
+    """Read a replay buffer: a part for each parallel environment, oldest step first.
 
     Without ``handle_timeout_termination``, a warning says that dones are read as terminal states.
 
-    :raises ValueError: for one that does not hold the states, or not how episodes ended
+    :raises ValueError: for a buffer that does not hold the task's states, or how episodes ended
     """
     name = type(buffer).__name__
     if isinstance(buffer.observations, dict):
@@ -154,7 +154,7 @@ def read_buffer(buffer: ReplayBuffer) -> Log:
             f"A {name} with handle_timeout_termination=False does not know which dones were time limits: all {n_dones} "
             "are read as terminal states, after which nothing is earned. Where the task has a time limit, collect with "
             "handle_timeout_termination=True.",
-            stacklevel=4,  # where the dataset was asked for
+            stacklevel=4,  # at the caller of load_dataset
         )
     rows = (buffer.pos - size + np.arange(size)) % buffer.buffer_size
     parts = []
@@ -182,7 +182,7 @@ def read_buffer(buffer: ReplayBuffer) -> Log:
 
 
 def import_minari(what: str) -> Any:
-    """:raises ImportError: where it is missing; it names what needs it"""
+    """:raises ImportError: where Minari is missing; the message names what needs it"""
     try:
         import minari
     except ImportError as error:
@@ -191,9 +191,9 @@ def import_minari(what: str) -> Any:
 
 
 def read_minari(source: Any, progress_bar: bool) -> Log:
-    """Read a Minari dataset, by its id or as it was loaded; an id that is not local is downloaded.
+    """Read a Minari dataset, given by its id or loaded already; one that is not local is downloaded.
 
-    :raises ValueError: where there is none, for a damaged one, and where observations are no vectors
+    :raises ValueError: for a missing or damaged dataset, and for observations that are no vectors
     """
     minari = import_minari(f"The dataset {source}")
     if isinstance(source, (str, os.PathLike)):
@@ -209,7 +209,7 @@ def read_minari(source: Any, progress_bar: bool) -> Log:
     episodes = tqdm(source.iterate_episodes(), desc=name, total=source.total_episodes, disable=not progress_bar)
     try:
         parts = [_of_episode(f"episode {episode.id} of {name}", episode) for episode in episodes]
-    except (KeyError, OSError, RuntimeError) as error:  # of HDF5, which does not name the file
+    except (KeyError, OSError, RuntimeError) as error:  # errors of HDF5 do not name the file
         raise ValueError(
             f"The dataset {name} in {source.spec.data_path} cannot be read; it is damaged: {error}"
         ) from error

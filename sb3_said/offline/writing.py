@@ -1,4 +1,4 @@
-"""Datasets into files that others read, too: an ``.npz`` with D4RL's columns and the task's id, or a Minari dataset."""
+"""Write datasets that other tools read, too: an ``.npz`` with D4RL's columns and the task's id, or a Minari dataset."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from sb3_said.offline.sources import TASK, import_minari
 
 
 def check_target(target: str | os.PathLike[str]) -> None:
-    """Refuse a place where a dataset cannot be written, before it is made.
+    """Refuse a target that cannot be written, before the dataset is made.
 
     :param target: path of an ``.npz``, or id of a Minari dataset such as ``"hopper/mine-v0"``
-    :raises ValueError: for a file of another format, no id of a Minari dataset, and what is there already
+    :raises ValueError: for a file of another format, text that is no id of Minari, and a target that exists already
     :raises ImportError: without Minari
     :raises OSError: for a folder that cannot be written
     """
@@ -45,7 +45,7 @@ def check_target(target: str | os.PathLike[str]) -> None:
         parse_dataset_id(name)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{name!r} is no id of a Minari dataset, such as hopper/mine-v0: {error}") from error
-    if (folder := get_dataset_path(name)).exists():  # of an attempt that has failed, too
+    if (folder := get_dataset_path(name)).exists():  # a failed attempt leaves one, too
         raise ValueError(f"{folder} is there already; give another name or version, or remove it.")
 
 
@@ -58,7 +58,7 @@ def write_dataset(
     :param target: path of an ``.npz``, or id of a Minari dataset such as ``"hopper/mine-v0"``
     :param env: the task it is of, with or without ``DelayedObservationWrapper``
     :param about: kept in the file, for its readers
-    :param algorithm: whose data it is, for Minari
+    :param algorithm: name of the algorithm that acted, for Minari
     :raises ValueError: as :func:`check_target`
     """
     check_target(target)
@@ -87,7 +87,7 @@ def _write_npz(data: Dataset, path: str | os.PathLike[str], env: gym.Env[Any, An
 
 
 def _write_minari(data: Dataset, name: str, env: gym.Env[Any, Any], about: str, algorithm: str) -> None:
-    """Write episodes, the task as it can be made again, and its reference returns where they are known."""
+    """Write episodes, how to make the task again, and its reference returns where they are known."""
     import minari
     from minari.data_collector import EpisodeBuffer
 
@@ -111,7 +111,7 @@ def _write_minari(data: Dataset, name: str, env: gym.Env[Any, Any], about: str, 
             )
         )
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # that nobody is named as its author, nor a link to its code
+        warnings.simplefilter("ignore", UserWarning)  # Minari's, that neither an author nor a link to code is named
         minari.create_dataset_from_buffers(
             name,
             buffers,
@@ -125,9 +125,9 @@ def _write_minari(data: Dataset, name: str, env: gym.Env[Any, Any], about: str, 
 
 
 def _registration_of(env: gym.Env[Any, Any], target: str) -> EnvSpec | None:
-    """Return how a task is made again: what was registered, with its own arguments and time limit.
+    """Return the spec that makes a task again: the registered one, with this task's arguments and time limit.
 
-    A file holds code by its name. Where code has none, warn, and return None.
+    A file can hold code only by its name. Where code has none, warn and return None.
     """
     own = env.unwrapped.spec
     if own is None:
@@ -137,7 +137,7 @@ def _registration_of(env: gym.Env[Any, Any], target: str) -> EnvSpec | None:
     spec.max_episode_steps = (env.spec or spec).max_episode_steps  # the task's own spec lacks it
     code = spec.entry_point
     name = getattr(code, "__qualname__", "")
-    if name.isidentifier():  # so no lambda, and not inside of something
+    if name.isidentifier():  # neither a lambda nor nested in a class or function
         spec.entry_point = f"{code.__module__}:{name}"
     try:
         spec.to_json()

@@ -1,4 +1,4 @@
-"""Checks of what a user gives: each refuses with what was given and what was expected."""
+"""Checks of what a user gives. Each error says what was given and what was expected."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ def check_settings(
     choices: Mapping[str, Collection[str]] | None = None,
     may_lack: Collection[str] = (),
 ) -> None:
-    """Hold the settings of a dataclass against their defaults, whose types they have.
+    """Check that the settings of a dataclass have the types of their defaults, and lie in their ranges.
 
-    :param at_least: the smallest value of some of them
-    :param at_most: the largest
-    :param choices: what the texts among them may be; None, too, where that is the default
+    :param at_least: the smallest value of some settings
+    :param at_most: the largest value of some settings
+    :param choices: the texts that a setting may be; it may also be None where that is its default
     :param may_lack: numbers that may be None
-    :raises ValueError: for another type, a number that is not finite or out of range, or no such choice
+    :raises ValueError: for a value of another type, a number that is not finite or out of range, or another text
     """
     choices, at_most = choices or {}, at_most or {}
     for field in fields(config):
@@ -53,16 +53,16 @@ def _is_number(value: Any) -> bool:
 
 
 def check_intervals(**intervals: int | None) -> None:
-    """:raises ValueError: for one that is given and below 1, or no whole number"""
+    """:raises ValueError: for an interval that is below 1, or no whole number; None is allowed"""
     for name, interval in intervals.items():
         if interval is not None:
             whole(name, interval)
 
 
 def whole(name: str, given: float, least: int = 1) -> int:
-    """Return a count; 1e4 is a float in YAML and in -params.
+    """Return a count as an int; YAML and ``-params`` may give it as a float.
 
-    :raises ValueError: for one below the least, or no whole number
+    :raises ValueError: for a number below ``least``, or no whole number
     """
     if given < least or given % 1 != 0:
         raise ValueError(f"{name} must be a whole number, at least {least}, got {given}.")
@@ -72,9 +72,9 @@ def whole(name: str, given: float, least: int = 1) -> int:
 def check_same(what: str, before: dict[str, Any], now: dict[str, Any], advice: str) -> None:
     """Compare settings.
 
-    :param what: has them, and how it began, for the error
-    :param advice: what to do
-    :raises ValueError: naming those that differ
+    :param what: how the error begins; it goes on "with other settings"
+    :param advice: how the error ends
+    :raises ValueError: naming the settings that differ
     """
     if differing := [key for key in sorted({*before, *now}) if before.get(key) != now.get(key)]:
         changes = "; ".join(f"{key} was {before.get(key)} and is now {now.get(key)}" for key in differing)
@@ -84,7 +84,7 @@ def check_same(what: str, before: dict[str, Any], now: dict[str, Any], advice: s
 def float_tensor(name: str, values: th.Tensor, shape: tuple[int | None, ...], device: th.device) -> th.Tensor:
     """Return values in float32 on a device.
 
-    :raises ValueError: for another shape, where ``None`` stands for any size, or no rows
+    :raises ValueError: for another shape (``None`` stands for any size), or no rows
     """
     values = th.as_tensor(values, dtype=th.float32, device=device)
     fits = values.dim() == len(shape)
@@ -99,7 +99,7 @@ def float_tensor(name: str, values: th.Tensor, shape: tuple[int | None, ...], de
 def finite_tensor(name: str, values: th.Tensor, shape: tuple[int | None, ...], device: th.device) -> th.Tensor:
     """Return values as :func:`float_tensor` does.
 
-    :raises ValueError: as there, and for numbers that are not finite
+    :raises ValueError: as it does, and for numbers that are not finite
     """
     values = float_tensor(name, values, shape, device)
     if not values.isfinite().all():
@@ -131,7 +131,7 @@ def checked_extra_states(
 ) -> tuple[th.Tensor, th.Tensor]:
     """Return extra states and which of them are known: (B, D, obs_dim) float32 and (B, D) bool.
 
-    :raises ValueError: for only one of the two, another shape than (B, D, obs_dim), or entries that mean nothing
+    :raises ValueError: for only one of the two, another shape, entries that are not finite, or flags beside 0 and 1
     """
     if history is None and known is None:  # zeros, so that a recorded graph always has these inputs
         return th.zeros(shape, dtype=th.float32, device=device), th.zeros(shape[:2], dtype=th.bool, device=device)

@@ -1,4 +1,4 @@
-"""Every setting of the planner, with its default and where that comes from."""
+"""Every setting of the planner, with its default and the source of that default."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sb3_said.planner.values import VALUE_SCALES
 SAMPLING_SETTINGS = (
     "sampling_steps", "n_candidates", "temperature", "scored_states", "choice_factor", "present", "decided_by"
 )  # fmt: skip
-#: Settings that say what weights of the same shapes mean.
+#: Settings that change what the weights mean, and not their shapes.
 WEIGHT_SETTINGS = ("prediction", "schedule", "mask", "relative_states", "action_transform")
 CHOICES: dict[str, tuple[str, ...]] = {
     "first_guess": ("prior", "none"),
@@ -36,7 +36,7 @@ PARTS = ("end_time_probability", "early_probability", "mask_end_probability", "e
 NOT_NEGATIVE = ("temperature", "choice_factor", "warmup_steps", "weight_decay", "weight_factor", "decision_weight")
 AT_LEAST = {"depth": 1, "horizon": 2, "sampling_steps": 1, "n_candidates": 1, "batch_size": 1}
 AT_LEAST |= dict.fromkeys((*NOT_NEGATIVE, *PARTS), 0)
-#: Far beyond what helps, but of parts: a setting above is a slip, and would ask for memory or hours.
+#: Parts are at most 1. The other limits lie far beyond what helps: more is a slip, and would cost memory or hours.
 AT_MOST = {"depth": 1000, "d_model": 16_384, "horizon": 1000, "sampling_steps": 1000, "n_candidates": 10_000}
 AT_MOST |= dict.fromkeys(PARTS, 1)
 
@@ -45,8 +45,8 @@ AT_MOST |= dict.fromkeys(PARTS, 1)
 class PlannerConfig:
     """Every setting of the planner and of its training; :meth:`paper` gives the paper's.
 
-    "measured" marks what small trials on two CPU cores favoured, "paper" what SAID states in text and tables,
-    "DV" the public code it follows where it states nothing (Lu et al. 2025).
+    "measured" marks what small trials on two CPU cores favoured. "paper" marks what the paper states in text and
+    tables, "DV" the public code that it follows where it states nothing (Lu et al. 2025).
 
     :raises ValueError: for a value outside what its comment allows
     """
@@ -54,31 +54,31 @@ class PlannerConfig:
     # Architecture
     depth: int = 2  # DV; the paper searches 2, 4, 8, and twice the depth costs twice the time
     d_model: int = 128  # as accurate as the paper's 256 in the same time on two cores; a multiple of 32
-    horizon: int = 8  # paper; a window is max_delay + horizon steps, >= 2 so that a state follows the decision
+    horizon: int = 8  # paper; a window has max_delay + horizon steps; >= 2, so that a state follows the decision
     embed_known: bool = True  # measured: buys as much accuracy as doubling the depth
-    # What plain networks make of what is known: the states since by a model of one step, and a clone's action. "prior":
-    # the network predicts what this guess does not, so that a planner begins as good as it (measured on logs and on an
-    # expert's replay, results/nine_logs.md and results/what_diffusion_buys.md). "none" is the paper's
+    # A guess by plain networks: a model of one step gives the states since the observation, a clone gives the action.
+    # "prior": the network predicts only what the guess misses, so that a planner begins as good as its guess (measured
+    # on logs and on an expert's replay, results/nine_logs.md and results/what_diffusion_buys.md). "none" is the paper's
     first_guess: str = "prior"
     # Diffusion
     prediction: str = "v"  # measured: safe with few steps; or "epsilon" (paper)
     schedule: str = "cosine"  # measured; or "linear" (DV)
     time_sampling: str = "logit_normal"  # measured: lower error of the decoded present; or "uniform" (DV)
-    # Part of the training windows at the last time, where all is noise, every sampling starts and a single step ends;
-    # "logit_normal" alone hardly ever draws it. Measured; 0 is DV's; in [0, 1]
+    # Part of the training windows at the last diffusion time, where all is noise. Every sampling starts there, and with
+    # one step the network is asked nowhere else; "logit_normal" hardly ever draws it. Measured; 0 is DV's; in [0, 1]
     end_time_probability: float = 0.25
     # Part of the training windows that start early in an episode (log-uniform over its steps). A good agent's replay
-    # has one start for a thousand steps, and a planner that falls there never gets to the rest: without, two of three
-    # planners of one replay did (measured, results/planner_lottery.md). 0 is the paper's; in [0, 1]
+    # has one start for a thousand steps, and a planner that falls there never gets to the rest. At 0 two of three
+    # planners of one replay fell (measured, results/planner_lottery.md). 0 is the paper's; in [0, 1]
     early_probability: float = 0.25
-    # Which actions a training window shows: those of a delay drawn from 0..max_delay, so that one network serves all;
-    # "own": the same, in windows whose decision was made on an observation of that age, where the data know it;
-    # "fixed": those of max_delay (paper); "none": no action, so that every window begins at the present and has horizon
-    # steps, and the first guess goes there from an old observation
+    # Which actions a training window shows. "random": those of a delay drawn from 0..max_delay, so that one network
+    # serves all. "own": the same, in windows whose decision was made on an observation of that age, where the data know
+    # it. "fixed": those of max_delay (paper). "none": none, so that every window begins at the present and has horizon
+    # steps; the first guess leads from an old observation to the present
     mask: str = "random"
     mask_end_probability: float = 0.5  # a guess: the longest mask is the hardest; in [0, 1]
-    # Part of the training windows that show more states than the first, any subset of those up to the decision index:
-    # 0 is the paper's; above it, late observations can be given to plan(), and 0.5 is a guess; in [0, 1]
+    # Part of the training windows that show more states than the first: any subset of those up to the decision index.
+    # Above 0, plan() can be given late observations; 0.5 is a guess. 0 is the paper's; in [0, 1]
     extra_state_probability: float = 0.0
     relative_states: bool = True  # measured: a third off the present's error; or False (paper)
     decision_weight: float = 5.0  # measured: factor on the error at the decision index; 1 (paper) to 5, 20 was worse
@@ -87,23 +87,22 @@ class PlannerConfig:
     sampling_steps: int = 5  # of DDIM; 99.6 % of the paper's return with 20
     n_candidates: int = 16  # measured; the paper's 50 cost three times as much
     # Factor on the initial noise, >= 0; at 0 one candidate is drawn and nothing chosen. Measured (results/settings.md):
-    # choosing by the critics, which the expert's actor has already followed, led to falls; the paper's are 0.1 to 1
+    # the expert's actor has followed the critics already, and a choice by them led to falls. The paper's are 0.1 to 1
     temperature: float = 0.0
-    # "decision": the decision alone, at the present that the candidates agree on, so that actions compete and not
-    # beliefs (measured: 2,875 against 2,199 for "future", 8 episodes each); "future": states after the decision index;
-    # "all": all states but the first (paper)
+    # What the values score. "decision": the decision alone, at the mean of the candidates' presents, so that actions
+    # compete and not beliefs (measured: 2,875 against 2,199 for "future", 8 episodes each); "future": states after the
+    # decision index; "all": all states but the first (paper)
     scored_states: str = "decision"
-    # None: the candidate of the highest value decides (paper). A number beta >= 0: the candidates' mean does, weighed
-    # by exp(beta * z), z a candidate's value in standard deviations of all; 1 is better at long delays (measured,
-    # results/settings.md)
+    # None: the candidate of the highest value decides (paper). A number beta >= 0: the candidates' mean decides. Each
+    # counts exp(beta * z), z its standardised value; 1 is better at long delays (measured, results/settings.md)
     choice_factor: float | None = None
-    # "inpainted" (paper): the present and the plan are one sample; "guessed": the present is the first guess's, and the
-    # planner plans from there as if it had seen it: at least level on logs and on an expert's replay, and worth twice
-    # as much on some (measured, results/nine_logs.md), as a decision from an old observation is nearer to the mean of
-    # what may be right. None: "guessed" where there is a guess and ``mask`` is "random" or "none"
+    # "inpainted" (paper): the present and the plan are one sample. "guessed": the present is the first guess's, and the
+    # planner plans from it as if it had been seen. On logs and on an expert's replay that is at least level, on some
+    # worth twice as much (measured, results/nine_logs.md): a decision inpainted from an old observation is nearer to
+    # the mean of what may be right. None: "guessed" where there is a guess and ``mask`` is "random" or "none"
     present: str | None = None
-    # "plan" (paper): the action that the plan has at the present; "actor": what SAID's expert does where it sees the
-    # guessed present, without delay; then no plan is made
+    # "plan" (paper): the action of the plan at the present. "actor": the action of SAID's expert, which is shown the
+    # guessed present as if without delay; then no plan is made
     decided_by: str = "plan"
     # Training
     learning_rate: float = 2e-3  # measured at depth 2, together with the warm-up
@@ -116,18 +115,18 @@ class PlannerConfig:
     ema_decay: float = 0.9999  # paper
     ema_warmup: bool = True  # without it 37 % of the initial weights remain after 10,000 steps
     # beta in the window weight exp(beta * (value - 1)). Measured: at the paper's 2 a clone of one replay still took its
-    # first steps as the few episodes do that fall there (results/planner_lottery.md)
+    # first steps like the few episodes that fall at once (results/planner_lottery.md)
     weight_factor: float = 4.0
-    # What that value is: "centred", from -1 at the lowest value of the data to 1 at the highest (DV; the paper does not
-    # say); "range", the same from 0 to 1; or "rank", the part of all windows that are worth less, so that beta picks as
-    # much of any data, but an early window that leads to a fall is hardly told from one that does not (measured, there)
+    # The scale of that value. "centred": from -1 at the lowest value of the data to 1 at the highest (DV; the paper
+    # does not say). "range": the same from 0 to 1. "rank": the part of all windows that are worth less. Then beta picks
+    # as much of any data, but hardly tells early windows that lead to a fall from others (measured, same page)
     value_scale: str = "centred"
     precision: str = "auto"  # bfloat16 autocast where the hardware has it; or "float32", "bfloat16"
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if isinstance(value, np.generic):
-                object.__setattr__(self, name, value.item())  # which JSON can hold
+                object.__setattr__(self, name, value.item())  # JSON can hold this
         check_settings(self, AT_LEAST, AT_MOST, CHOICES, may_lack=("choice_factor", "gradient_clip"))
         self._settle_present()
         object.__setattr__(self, "betas", tuple(self.betas))  # JSON gives a list back
@@ -140,10 +139,10 @@ class PlannerConfig:
             )
 
     def _settle_present(self) -> None:
-        """:raises ValueError: for a guessed present where nothing guesses, and any other where none is inpainted"""
+        """:raises ValueError: for a guessed present where nothing guesses, and another where mask or actor need it"""
         can_guess = self.first_guess != "none" and self.mask != "fixed"
         if self.present is None:
-            is_guessed = can_guess and self.mask != "own"  # who plans as if it saw the guess does what is done at age 0
+            is_guessed = can_guess and self.mask != "own"  # a plan from a guess would use age 0 alone
             object.__setattr__(self, "present", "guessed" if is_guessed else "inpainted")
         if self.present == "guessed" and not can_guess:
             raise ValueError(
@@ -170,9 +169,9 @@ class PlannerConfig:
 
     @classmethod
     def paper(cls, depth: int = 8, temperature: float = 0.6, **changes: object) -> PlannerConfig:
-        """Return the settings of the paper's Table 3, and of its Table 4 depth and temperature, tuned per task.
+        """Return the settings of the paper's Table 3, with a depth and temperature of its Table 4, tuned per task.
 
-        What neither the tables nor the text state is as in DV. ``docs/design.md`` has what differs all the same.
+        What neither the tables nor the text state is as in DV. ``docs/design.md`` lists what differs all the same.
 
         :param changes: other fields to set
         """

@@ -16,7 +16,7 @@ import torch as th
 
 START_TIME = 1e-3  # the cleanest time, in training and as the last solver time (CleanDiffuser, and so the paper)
 END_TIMES = {
-    "cosine": 0.9946,  # alpha(1) is 0 and could not be divided by; the same stop as DPM-Solver's
+    "cosine": 0.9946,  # alpha(1) is 0, and to_clean divides by alpha; DPM-Solver stops here, too
     "linear": 1.0,
 }
 SCHEDULES = tuple(END_TIMES)
@@ -61,9 +61,9 @@ def gaussian_prediction(
     sigma: float | th.Tensor,
     prediction: str,
 ) -> tuple[th.Tensor, th.Tensor]:
-    """Return the best prediction at a noisy sample x if clean entries are of N(mean, std^2), and how far it is off.
+    """Return the best prediction at a noisy sample x whose clean entries are from N(mean, std^2), and its error.
 
-    The latter is a standard deviation. For v and N(0, 1) they are 0 and 1. Arguments broadcast.
+    The error is a standard deviation. For v and N(0, 1) the two are 0 and 1. Arguments broadcast.
     """
     variance = alpha**2 * std**2 + sigma**2  # of x
     if prediction == "epsilon":
@@ -80,7 +80,7 @@ def draw_times(
 ) -> th.Tensor:
     """Draw training times on the generator's device: (n,) float32 in [START_TIME, END_TIMES[schedule]].
 
-    :param time_sampling: ``"uniform"`` (DV's) or ``"logit_normal"`` (Esser et al. 2024), more in the middle
+    :param time_sampling: ``"uniform"`` (DV's), or ``"logit_normal"`` (Esser et al. 2024) for more in the middle
     :param end_probability: part of the times that are the last one, where every sampling starts
     """
     device = "cpu" if generator is None else generator.device

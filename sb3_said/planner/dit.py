@@ -16,7 +16,7 @@ def sinusoidal_positions(length: int, d_model: int) -> th.Tensor:
     """Return a fixed embedding of the positions 0..length-1: (length, d_model) float32.
 
     The angular frequencies run from 1 to 1/length radians a step, so that every pair of features changes over a window.
-    The public code under the paper's results multiplies integers instead, where all frequencies but the first are 0.
+    The public code under the paper's results rounds the frequencies down to integers, so that all but the first are 0.
     """
     frequencies = float(length) ** -th.linspace(0.0, 1.0, d_model // 2)  # (d_model / 2,)
     angles = th.arange(length, dtype=th.float32)[:, None] * frequencies  # (L, d_model / 2)
@@ -41,7 +41,7 @@ class DiTBlock(nn.Module):
         super().__init__()
         self.qkv = nn.Linear(d_model, 3 * d_model)
         self.attention_out = nn.Linear(d_model, d_model)
-        # Exact: the tanh in the public code approximates it to 5e-4, and takes four times as long on a CPU
+        # Exact GELU: the public code's tanh is off by up to 5e-4, and takes four times as long on a CPU
         self.mlp = nn.Sequential(nn.Linear(d_model, 4 * d_model), nn.GELU(), nn.Linear(4 * d_model, d_model))
 
     def forward(
@@ -64,8 +64,8 @@ class DiTBlock(nn.Module):
         m, length, d_model = x.shape
         qkv = self.qkv(x).view(m, length, 3, -1, HEAD_DIM).permute(2, 0, 3, 1, 4).contiguous()
         q, k, v = qkv.view(3, -1, length, HEAD_DIM).unbind()  # each (M * heads, L, HEAD_DIM)
-        # Plain products: windows are short, and PyTorch's fused attention costs CPUs more in both directions. The first
-        # argument counts for nothing, but on MPS a NaN in it would.
+        # Plain products: windows are short, and PyTorch's fused attention is slower on CPUs, forward and backward.
+        # With beta=0 the first argument counts for nothing; but on MPS a NaN in it would count, so it is 0
         scores = th.baddbmm(q.new_zeros(1), q, k.mT, beta=0, alpha=HEAD_DIM**-0.5)  # (M * heads, L, L)
         if bias is not None:
             scores = (scores.view(m, -1, length, length) + bias).view(-1, length, length)
@@ -74,15 +74,15 @@ class DiTBlock(nn.Module):
 
 
 class DiT1d(nn.Module):
-    """Predict v or the noise of a noisy window whose known entries are clean, or what a prior of it is off by.
+    """Predict v or the noise of a noisy window whose known entries are clean, or the error of a prior's prediction.
 
-    A call has three parts, because two of them do not change from one denoising step or candidate to the next:
-    :meth:`modulations` depends on the time alone, :meth:`context` on what is known alone, :meth:`forward` on both.
+    A call has three parts, since only the last is repeated for each candidate and denoising step: :meth:`modulations`
+    depends on the diffusion time alone, :meth:`context` on what is known alone, :meth:`forward` on both.
 
     :param max_delay: D, the most actions that can be known
     :param length: steps of the longest window
     :param d_model: width, a multiple of 32
-    :param embed_known: add an embedding of the whole known part to every token, beside showing it in its place
+    :param embed_known: add an embedding of all known entries to every token; each is shown in its own place anyway
     :param extra_states: states at indices 1..D may be known too, and are embedded
     :param first_guess: a guess of the window is shown beside what is known
     """
@@ -136,28 +136,29 @@ class DiT1d(nn.Module):
     def modulations(self, t: th.Tensor) -> th.Tensor:
         """Return what the time changes in every layer: (n, 6 * depth + 2, d_model) float32.
 
-        Of each block shift, factor and gate of the attention, then of the MLP; at last shift and factor of the output.
+        First of each block: shift, factor and gate of the attention, then of the MLP. Last: shift and factor of the
+        output.
 
         :param t: (n,) float32 diffusion times
         """
         angles = t[:, None] * self.frequencies  # (n, N_TIME_FEATURES / 2)
         embedded = self.time_embedding(th.cat([angles.cos(), angles.sin()], dim=-1))  # (n, d_model)
         rows = self.modulation(F.silu(embedded)).unflatten(-1, (-1, self.d_model))
-        return rows + self.is_factor  # adaLN-zero predicts factors less 1. In float32, as the stream they act on
+        return rows + self.is_factor  # adaLN-zero predicts factors minus 1. In float32, like the residual stream
 
     def context(self, window: th.Tensor, known: th.Tensor, guess: th.Tensor | None = None) -> th.Tensor:
-        """Return what is added to the tokens because of their place, of what is known and guessed: (B, L, d_model).
+        """Return what positions, known entries and the first guess add to the tokens: (B, L, d_model).
 
         :param window: (B, L, obs_dim + act_dim), normalised, L at most ``length``; only known entries are read
         :param known: (B, L, obs_dim + act_dim) bool known mask
-        :param guess: (B, L, obs_dim + act_dim), needed where the network was made to be shown one
+        :param guess: (B, L, obs_dim + act_dim), needed by a network with ``first_guess``
         """
         # (B, L, 2): whether the state is known, and the action
         flags = th.stack((known[..., 0], known[..., self.obs_dim]), dim=-1).to(window.dtype)
         added = self.flag_embedding(flags) + self.positions[: window.shape[1]]
         if self.guess_embedding is not None:
             assert guess is not None
-            states = guess[..., : self.obs_dim]  # shown as moves since the first, too, which differ by little
+            states = guess[..., : self.obs_dim]  # their moves since the first are shown, too: states differ by little
             added = added + self.guess_embedding(th.cat([guess, states - states[:, :1]], dim=-1))
         if self.known_embedding is None:
             return added
@@ -175,10 +176,10 @@ class DiT1d(nn.Module):
     ) -> th.Tensor:
         """Return the prediction for each entry: (B * N, L, obs_dim + act_dim).
 
-        :param x: (B * N, L, obs_dim + act_dim) noisy windows, known entries clean; N in a row share a context
+        :param x: (B * N, L, obs_dim + act_dim) noisy windows, known entries clean; N successive ones share a context
         :param context: (B, L, d_model), from :meth:`context`
-        :param modulations: (B * N, 6 * depth + 2, d_model), from :meth:`modulations`, or (6 * depth + 2, d_model) of
-            one time for all
+        :param modulations: (B * N, 6 * depth + 2, d_model), from :meth:`modulations`, or (6 * depth + 2, d_model)
+            where all windows have one time
         :param valid: (B * N, L) bool, the tokens that may be attended to; all by default
         """
         tokens = self.token_embedding(x).unflatten(0, (len(context), -1)) + context[:, None]  # (B, N, L, d_model)

@@ -1,4 +1,4 @@
-"""Where a planner begins: what plain networks make of what is known."""
+"""The first guess: plain networks predict a window from what is known, before the planner does."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from sb3_said.replay.windows import Windows, WindowSource
 CLONE_WIDTH = 256
 CLONE_LEARNING_RATE = 1e-3
 GUESS_BATCH_SIZE = 256
-# Of many steps at once: updates of one step for each, the part of their rate (at a quarter an Ant-v5 lost a third of
-# its return, results/first_guess.md), and the largest norm of a gradient
+# Training over many steps at once: the number of single-step updates for one such update, its part of their learning
+# rate (at a quarter an Ant-v5 lost a third of its return, results/first_guess.md), and the largest norm of a gradient
 ROLLED_EACH, ROLLED_RATE, ROLLED_CLIP = 16, 0.1, 1.0
 
 
 class FirstGuess(nn.Module):
-    """A model of one step, rolled out over the actions since the observation, and a clone that answers where it ends.
+    """A model of one step, rolled out over the actions since the observation, and a clone that acts on its last state.
 
-    These two learn sooner than the planner how a task moves and what its data does, as a sample costs a plain network
-    little. But the model's errors compound, and the clone does not know of them. The planner is shown the guess, and
-    may depart from it.
+    A sample costs a plain network little. So the two learn sooner than the planner how a task moves and which actions
+    the data has. But the model's errors compound, and the clone does not know of them. The planner is shown the guess,
+    and may depart from it.
 
     States are z-scored, actions in [-1, 1].
     """
@@ -40,12 +40,12 @@ class FirstGuess(nn.Module):
     def forward(
         self, states: th.Tensor, actions: th.Tensor, delay: th.Tensor, known: th.Tensor, longest: int
     ) -> th.Tensor:
-        """Guess windows: the states up to the present, which stays, and from there on the clone's action.
+        """Guess windows: the states up to the present; from there on the present again, with the clone's action.
 
-        :param states: (B, L, obs_dim), of which those are read that are known
-        :param actions: (B, L, act_dim), of which those before the decision are read
+        :param states: (B, L, obs_dim); known ones count
+        :param actions: (B, L, act_dim); those before the decision index count
         :param delay: (B,) int64 d
-        :param known: (B, L) bool, the states that are known, the first always
+        :param known: (B, L) bool, which states are known; the first always is
         :param longest: an upper bound of the delays, below L
         :return: (B, L, obs_dim + act_dim), 0 where an action is known
         """
@@ -53,9 +53,9 @@ class FirstGuess(nn.Module):
 
     @th.no_grad()
     def roll_out(self, states: th.Tensor, actions: th.Tensor, known: th.Tensor, n_steps: int) -> th.Tensor:
-        """Return the states that the model makes of the first, known ones as given: (B, n_steps + 1, obs_dim).
+        """Return the states that the model predicts from the first, known ones as given: (B, n_steps + 1, obs_dim).
 
-        The arguments are those of :meth:`forward`, of the actions here all that are rolled over.
+        The arguments are those of :meth:`forward`, but here the first ``n_steps`` actions count.
         """
         rolled = [states[:, 0]]
         for k in range(n_steps):
@@ -64,9 +64,9 @@ class FirstGuess(nn.Module):
 
     @th.no_grad()
     def windows(self, rolled: th.Tensor, delay: th.Tensor, length: int) -> th.Tensor:
-        """Return guesses of windows whose present is a step of what was rolled out, as :meth:`forward`.
+        """Return guesses as :meth:`forward` does, of windows whose present is one of the states rolled out.
 
-        :param rolled: (B, n_steps + 1, obs_dim)
+        :param rolled: (B, n_steps + 1, obs_dim), from :meth:`roll_out`
         :param delay: (B,) int64, at most n_steps
         :param length: L
         """
@@ -101,11 +101,11 @@ def fit_first_guess(
 ) -> bool:
     """Train the plain networks on single steps, then the model alone on as many at once as it will be rolled out over.
 
-    A model that learned single steps has never met its own answers, and fails at old observations first where a policy
-    acts on them (measured, results/first_guess.md).
+    A model that learned single steps has never met its own answers. Where a policy acts on these, the model fails, at
+    old observations first (measured, results/first_guess.md).
 
     :param guess: to train, on the device of the sources
-    :param source: windows whose values are those that weigh them
+    :param source: windows, weighed by their ``values``
     :param normalizer: fitted to the source
     :param config: of the planner: how windows are drawn and weighed
     :param n_updates: on single steps
@@ -113,9 +113,9 @@ def fit_first_guess(
     :param longest: steps that the model will be rolled out over; at 1 there is no second part
     :param progress_bar: show one
     :param should_stop: asked after every update
-    :param older: steps that make half of each of the model's batches, and none of the clone's: what policies did ages,
-        and how the task moves does not. Where the newest are few, a quarter off the model's errors, and nothing lost
-        where they are many (results/first_guess.md)
+    :param older: older steps, for half of each of the model's batches and none of the clone's: what a policy did goes
+        out of date, how the task moves does not. They take a quarter off the model's errors where the newest steps are
+        few, and cost nothing where those are many (results/first_guess.md)
     :return: whether all updates were made
     """
     model, clone = guess.model, guess.clone

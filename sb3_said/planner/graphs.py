@@ -10,16 +10,17 @@ import torch as th
 
 EAGER_CALLS = 3  # before recording, as torch.cuda.graph asks: libraries set themselves up, optimizers make their state
 
-#: A process records one graph at a time, and a recording has its inputs in one place, whatever thread asks.
+#: For threads: a process can record one graph at a time, and a recording has one place for its inputs.
 _LOCK = threading.RLock()
 
 
 @cache
 def _side_stream(device: th.device) -> th.cuda.Stream:
-    """Return the one stream on which functions are run before they are recorded, and recorded.
+    """Return the one stream on which functions run before they are recorded, and on which they are recorded.
 
-    Not the default stream, which cannot be recorded and to which gradients would be tied; and one for all, as libraries
-    keep memory for each that they have seen. ``torch.cuda.graph`` would take one of the current GPU.
+    The default stream cannot be recorded, and gradients would be tied to it. All functions share one stream, because
+    libraries keep memory for each that they have seen. By itself ``torch.cuda.graph`` would take one of the current
+    GPU.
     """
     return th.cuda.Stream(device)
 
@@ -28,12 +29,13 @@ class Recording:
     """Runs one function of tensors on a GPU: a few times as it is, then recorded once and replayed.
 
     The function must do the same work on every call, on tensors that stay in their places, and never wait for the
-    device. A planner's update is about a thousand launches without this, a decision some hundreds. It is handed over at
-    each call and not kept: it often belongs to whoever has the recording, and such a circle would hold a GPU's memory
-    until Python looks for circles.
+    device. Without a recording a planner's update takes about a thousand launches, a decision some hundreds.
+
+    The function is given at each call and not kept. It often belongs to the owner of the recording, and such a cycle of
+    references would hold a GPU's memory until Python's garbage collector finds it.
 
     :param device: the GPU
-    :param generator: that the function draws from, if any; replays draw from it what the function itself would
+    :param generator: from which the function draws, if it does; replays draw from it what the function would
     """
 
     def __init__(self, device: th.device, generator: th.Generator | None = None) -> None:
@@ -46,7 +48,7 @@ class Recording:
         self.graph: th.cuda.CUDAGraph | None = None
 
     def __call__(self, function: Callable[..., tuple[th.Tensor, ...]], *inputs: th.Tensor) -> tuple[th.Tensor, ...]:
-        """Return the function of inputs, which have the same shapes in all calls.
+        """Return the function's outputs for inputs, which have the same shapes in all calls.
 
         :param function: the same in all calls; maps the inputs to a tuple of tensors
         """
@@ -67,7 +69,7 @@ class Recording:
         graph = th.cuda.CUDAGraph()
         if self.generator is not None:
             graph.register_generator_state(self.generator)
-        # Recorded, not run. Another thread may go on with the GPU meanwhile
+        # The function is recorded here and not run. "thread_local" lets other threads go on with the GPU meanwhile
         with th.cuda.graph(graph, stream=_side_stream(self.device), capture_error_mode="thread_local"):
             self.outputs = function(*self.inputs)
         self.graph = graph

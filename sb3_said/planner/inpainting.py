@@ -74,10 +74,10 @@ def draw_delays(
 ) -> th.Tensor:
     """Draw the mask lengths of a training batch on the generator's device: (B,) int64 in 0..D.
 
-    :param mask: ``"random"``: one network for every delay up to D; ``"fixed"``: always D (the paper's); ``"none"``:
-        always 0; ``"own"``: as ``"random"``
+    :param mask: ``"random"`` or ``"own"``: any of 0..D, so that one network serves every delay; ``"fixed"``: always D
+        (the paper's); ``"none"``: always 0
     :param end_probability: with this probability a random length is 0 or D, half each, instead of uniform over 0..D:
-        0 starts every episode and D is the longest and hardest
+        every episode starts with 0, and D is the hardest
     """
     device = "cpu" if generator is None else generator.device
     if mask in ("fixed", "none"):
@@ -93,9 +93,9 @@ def draw_known_states(
 ) -> th.Tensor:
     """Draw which of the states s_{t-D+1..t} a training batch shows, on the generator's device: (B, D) bool.
 
-    A window that shows any draws its own share of known states, uniform in [0, 1]: every number of them is as likely.
+    A window that shows any draws its own share of them, uniform in [0, 1]. So every number of them is as likely.
 
-    :param probability: of a window to show any
+    :param probability: that a window shows any
     """
     device = "cpu" if generator is None else generator.device
     shows_any = th.rand(batch_size, 1, generator=generator, device=device) < probability

@@ -13,8 +13,8 @@ LARGEST_ACTION = 0.999  # the paper's bound before arctanh
 class Normalizer(nn.Module):
     """Z-score states and actions; its statistics are buffers, so they are saved with the planner.
 
-    With ``relative_states`` a window holds, behind its first state, how far each state has moved from there, in
-    standard deviations of such moves at that index: states a few steps apart differ by little, and that little counts.
+    With ``relative_states`` every state but the first is given as its move from the first, in standard deviations of
+    the moves at its index: states a few steps apart differ by little, and that little counts.
 
     :param window_length: L, steps of a window
     :param relative_states: see above; False z-scores every state alike (paper)
@@ -55,7 +55,7 @@ class Normalizer(nn.Module):
 
     @th.no_grad()
     def fit_moves(self, windows: Windows) -> None:
-        """Take over how far states move within a window, index by index; after :meth:`fit`."""
+        """Take over how far states move within a window, index by index; call :meth:`fit` before."""
         z = self.normalize_states(windows.states)
         moves, valid = z[:, 1:] - z[:, :1], windows.valid[:, 1:, None]
         std = (th.where(valid, moves**2, 0.0).sum(0) / valid.sum(0).clamp(min=1)).sqrt()  # (L - 1, obs_dim)

@@ -1,4 +1,4 @@
-"""Plain networks: what a planner is shown first, and what it is measured against."""
+"""Plain networks: those of a planner's first guess, and the regression that a planner is measured against."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from tqdm.auto import tqdm
 from sb3_said.replay.windows import mean_and_deviation
 
 MODEL_WIDTH, MODEL_BLOCKS = 256, 4
-# Standard deviations: a model that is asked far from its data must not run away. A log without noise has falls at 31
+# In standard deviations: a model asked far from its data must not diverge. Falls in a log without noise lie at 31
 FARTHEST = 100.0
-RIGHT = 1e-4  # squared error, in moves, below which an entry counts as known: a hundredth of its move
+RIGHT = 1e-4  # squared error below which an entry counts as known: that of a hundredth of its usual move
 
 
 def plain_network(n_in: int, n_out: int, hidden: int) -> nn.Sequential:
@@ -32,9 +32,9 @@ def descend(
     progress_bar: bool,
     should_stop: Callable[[], bool] | None,
 ) -> bool:
-    """Make updates of Adam, whose rates fall to 0 by a cosine; return whether all were made.
+    """Make updates of Adam, whose learning rates fall to 0 by a cosine; return whether all were made.
 
-    :param loss: of a batch that it draws
+    :param loss: draws a batch and returns its loss
     :param rates: learning rate of each network
     :param clip: largest norm of a network's gradient; None for any
     :param name: for the progress bar
@@ -68,12 +68,12 @@ class ZScored(nn.Module):
 
     @property
     def has_learned(self) -> bool:
-        """Whether it was scaled to what it learned from."""
+        """Whether :meth:`scale_to` has given it a scale."""
         return bool((self.mean != 0).any() or (self.std != 1).any())
 
     @th.no_grad()
     def scale_to(self, rows: th.Tensor) -> None:
-        """Take over how rows (M, n) are spread; an entry that never varies keeps its scale."""
+        """Take over mean and deviation of rows (M, n); an entry that never varies keeps its scale."""
         mean, std = mean_and_deviation(rows)
         self.mean.copy_(mean)
         self.std.copy_(std)
@@ -83,22 +83,22 @@ class ZScored(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """Two layers whose answer is added to what they read, normalised before (as in transformers, and in SimbaV1)."""
+    """Two layers that read the normalised input; their output is added to it (as in transformers and SimbaV1)."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
         self.net = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
 
     def forward(self, x: th.Tensor) -> th.Tensor:
-        """Return another (B, width)."""
+        """Map (B, width) to (B, width)."""
         return x + self.net(x)
 
 
 class OneStepModel(nn.Module):
-    """Predicts the state that follows an action, as a difference from the one before, in units of its usual moves.
+    """Predicts the state that follows an action: its difference from the state before, in units of the usual moves.
 
-    Four residual blocks are a quarter nearer than two, and more than that nearer than two plain layers (measured,
-    results/first_guess.md, results/nine_logs.md).
+    The error of four residual blocks is a quarter below that of two, and further below that of two plain layers
+    (measured, results/first_guess.md, results/nine_logs.md).
     """
 
     learning_rate = 2e-3  # of Adam, results/nine_logs.md has others
@@ -121,12 +121,12 @@ class OneStepModel(nn.Module):
     def loss(self, states: th.Tensor, actions: th.Tensor, follows: th.Tensor) -> th.Tensor:
         """Return the mean over steps and entries of log(1 + e / RIGHT), e an entry's mean squared error, in moves.
 
-        The model goes on from its own answers, as it is used. Up to constants it is the negative log-likelihood of
-        Gaussian errors, each entry with a variance of its own, as the batch has it. A plain mean would be about what
-        cannot be foreseen: 78 of Ant-v5's 105 entries are contact forces (measured, results/first_guess.md).
+        The model goes on from its own answers, as in use. Up to constants the loss is the negative log-likelihood of
+        Gaussian errors, where each entry has its variance in the batch. A plain mean would mostly count what cannot be
+        foreseen: 78 of Ant-v5's 105 entries are contact forces (measured, results/first_guess.md).
 
-        :param states: (B, K + 1, obs_dim), one after the other
-        :param actions: (B, K, act_dim), between them
+        :param states: (B, K + 1, obs_dim), successive and z-scored
+        :param actions: (B, K, act_dim), in [-1, 1], between the states
         :param follows: (B, K) bool, whether each state but the first is of the same episode
         """
         state, losses = states[:, 0], []

@@ -1,4 +1,4 @@
-"""The inpainting planner: hidden present and plan from a delayed observation and the actions sent since."""
+"""The inpainting planner: finds the present and a plan from a delayed observation and the actions sent since."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from sb3_said.planner.prior import Prior
 from sb3_said.planner.selection import ValueFn, choose, score
 from sb3_said.replay.windows import Windows
 
-MAX_GRAPHS = 8  # of a GPU; each keeps the memory of one decision
+MAX_GRAPHS = 8  # of one planner; each keeps the GPU memory of one decision
 
 
 class Plan(NamedTuple):
     """Candidate plans for B decisions, in environment units."""
 
-    action: th.Tensor  # (B, act_dim), in [-1, 1]: the best candidate's action at the decision index, or their mean
-    present: th.Tensor  # (B, obs_dim): s_t, the mean of what the candidates decode, or the first guess's
+    action: th.Tensor  # (B, act_dim), in [-1, 1], at the decision index: the best candidate's, or the weighed mean
+    present: th.Tensor  # (B, obs_dim): s_t, the mean of the candidates', or the first guess's
     states: th.Tensor  # (B, N, L, obs_dim), L the largest delay of the decisions plus the horizon
     actions: th.Tensor  # (B, N, L, act_dim), in [-1, 1]
-    values: th.Tensor  # (B, N), the scores they were chosen or weighed by
+    values: th.Tensor  # (B, N), scores by which the candidates were chosen or weighed
 
 
 class InpaintingPlanner(nn.Module):
@@ -82,7 +82,7 @@ class InpaintingPlanner(nn.Module):
         self._graphs: dict[Hashable, Recording] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_graphs": {}}  # a copy records its own
+        return {**self.__dict__, "_graphs": {}}  # a copy records its own graphs
 
     @property
     def device(self) -> th.device:
@@ -109,8 +109,8 @@ class InpaintingPlanner(nn.Module):
 
         :param states: (M, obs_dim), environment units
         :param actions: (M, act_dim), in [-1, 1]
-        :param windows: of ``window_length`` steps, which give the moves of ``config.relative_states`` their scale;
-            without them, moves keep the states' own
+        :param windows: of ``window_length`` steps; with ``config.relative_states`` they give moves their scale, which
+            is else that of the states
         :raises ValueError: for a wrong shape, no rows, or numbers that are not finite
         """
         states = finite_tensor("states", states, (None, self.obs_dim), self.device)
@@ -127,8 +127,8 @@ class InpaintingPlanner(nn.Module):
         assert self.prior is not None and self.first_guess is not None
         states, actions, valid, _ = windows.to(self.device)
         clean, length = self.normalizer.normalize(states, actions), self.window_length
-        z, known = self.normalizer.normalize_states(states), th.zeros_like(valid)  # beyond the first, (M, L)
-        rolled = self.first_guess.roll_out(z, actions, known, self.max_delay)  # once: a delay's is a part of it
+        z, known = self.normalizer.normalize_states(states), th.zeros_like(valid)  # none but the first, (M, L)
+        rolled = self.first_guess.roll_out(z, actions, known, self.max_delay)  # for all delays: each uses a part
         for d in range(self.max_delay + 1):
             delay = th.full((len(states),), d, device=self.device)
             guess = self.first_guess.windows(rolled, delay, length)
@@ -151,7 +151,7 @@ class InpaintingPlanner(nn.Module):
         :param weight: (B,) factor of each window's error; 1 by default
         :param generator: of mask lengths, known states, noise and times; torch's global one by default
         :return: float32 scalar
-        :raises ValueError: for windows of another shape or delays outside 0..max_delay (on a GPU, delays are not read)
+        :raises ValueError: for windows of another shape, or delays outside 0..max_delay (unchecked if on a GPU)
         """
         config, device, length = self.config, self.device, self.window_length
         states = float_tensor("windows.states", windows.states, (None, length, self.obs_dim), device)
@@ -164,12 +164,12 @@ class InpaintingPlanner(nn.Module):
             weight = float_tensor("weight", weight, (n,), device)
         if delay is None:
             delay = inpainting.draw_delays(n, self.max_delay, config.mask, config.mask_end_probability, generator)
-        # Delays on a GPU are not read back: every update would wait for it, and a recorded one could not
+        # Delays on a GPU are not checked: every update would wait for it, which a recorded one cannot
         delay = checked_delay(delay, n, self.max_delay).to(device) if delay.device.type == "cpu" else delay
         valid = windows.valid[:, :length].to(device) & self._within(delay, length)  # (B, L)
         clean = self.normalizer.normalize(states, actions)  # (B, L, obs_dim + act_dim)
-        # Steps that are not valid are neither shown nor learned: those behind an episode's end repeat its last row,
-        # and a decision at a small delay does without those behind its horizon
+        # Steps that are not valid are neither shown nor learned: those after an episode's end repeat its last row,
+        # and those after the horizon of a small delay do not exist at run time
         state_known = None
         if config.extra_state_probability > 0:
             state_known = inpainting.draw_known_states(n, self.max_delay, config.extra_state_probability, generator)
@@ -213,9 +213,9 @@ class InpaintingPlanner(nn.Module):
         With ``config.choice_factor`` the decision is the candidates' mean instead, weighed by their values. At
         temperature 0, where all candidates are alike, and by default without a ``value_fn``, only one is drawn.
 
-        On a GPU, a few calls with the same sizes and settings record the decision as one graph. The ``value_fn`` must
-        then be a module or a method of one and never wait for the device. With any other ``value_fn``, which may read
-        what a graph would not see change, nothing is recorded.
+        On a GPU the decision is recorded as one graph, after a few calls with the same sizes and settings. For this the
+        ``value_fn`` must be a module or a method of one, and never wait for the device. With any other ``value_fn``
+        nothing is recorded, since a graph would not see it change.
 
         With ``mask="fixed"`` every window has ``max_delay`` known actions. At an episode's start, s_0 stands for
         s_{t-D} (paper, Appendix B.1) and zeros for the actions before it (section 4.4).
@@ -244,7 +244,7 @@ class InpaintingPlanner(nn.Module):
         extra_states = self._extra_states(n, state_history, state_known)
         shortest, longest = int(delay.min()), int(delay.max())
         is_recorded = self._can_be_recorded(value_fn)
-        # A decision costs what its age costs; but on a GPU hardly less, and one graph serves all ages
+        # Shorter windows save time at smaller ages. On a GPU they save hardly any, and one graph serves all ages
         length = self.window_length if is_recorded else longest + config.horizon
         temperature = config.temperature if temperature is None else temperature
         window = (length, self.obs_dim + self.act_dim)
@@ -276,7 +276,7 @@ class InpaintingPlanner(nn.Module):
             plan = plan._replace(states=plan.states[:, :, :reached], actions=plan.actions[:, :, :reached])
         else:
             plan = self._inpaint(steps, value_fn, shortest, longest > shortest, *inputs)
-        if ~plan.values.amax(1).isfinite().all() | ~plan.action.isfinite().all():  # of a NaN, too
+        if ~plan.values.amax(1).isfinite().all() | ~plan.action.isfinite().all():  # amax keeps a NaN
             found = "The planner's candidates are not finite; check its weights"
             if plan.actions.isfinite().all() and plan.states.isfinite().all():
                 found = "value_fn returned NaN or infinity, or -inf for all, so that no candidate is the best; check it"
@@ -327,8 +327,9 @@ class InpaintingPlanner(nn.Module):
     def _extra_states(
         self, n: int, state_history: th.Tensor | None, state_known: th.Tensor | None
     ) -> tuple[()] | tuple[th.Tensor, th.Tensor]:
-        """Return the extra known states of n decisions, (n, D, obs_dim) and (n, D) bool; none of a planner without.
+        """Return the extra states of n decisions, and which are known; nothing for a planner without extra states.
 
+        :return: (n, D, obs_dim) and (n, D) bool
         :raises ValueError: for wrong shapes, and for extra states that the network was not trained with
         """
         if self.config.extra_state_probability > 0:
@@ -369,11 +370,11 @@ class InpaintingPlanner(nn.Module):
         state_history: th.Tensor | None = None,
         state_known: th.Tensor | None = None,
     ) -> Plan:
-        """Go from what is known and initial noise to the decision, and never wait for the device on the way.
+        """Make the decision from what is known and initial noise, without waiting for the device.
 
         :param shortest: a lower bound of the delays
         :param is_mixed: whether delays may differ, so that some windows end before others
-        :param times: (n_steps,) of the steps
+        :param times: (n_steps,), the steps' diffusion times
         :param x: (B, N, L, obs_dim + act_dim) initial noise, scaled
         :param state_history: (B, D, obs_dim)
         :param state_known: (B, D) bool
@@ -400,7 +401,7 @@ class InpaintingPlanner(nn.Module):
         def impose(x: th.Tensor) -> th.Tensor:
             return th.where(known[:, None], clean[:, None], x)
 
-        # Of the largest age, so that decisions at all ages have one number format
+        # The size at the largest age, so that decisions at all ages have one number format
         size = x.shape[0] * x.shape[1] * self.window_length * self.config.d_model
         with autocast(self.config.precision, x.device, size):
             x = diffusion.solve(predict, x, steps, self.config.prediction, impose)
@@ -427,9 +428,9 @@ class InpaintingPlanner(nn.Module):
         delay: th.Tensor,
         x: th.Tensor,
     ) -> Plan:
-        """Plan from the first guess's present as from an observation of age 0, and write down how it came there.
+        """Plan from the guessed present as from an observation of age 0, and put the guessed past before the plan.
 
-        The arguments are those of :meth:`_inpaint`, and what it makes of them.
+        The arguments are those of :meth:`_inpaint`, with its ``given`` and ``known`` in place of what they are made of.
         """
         states, actions = self._guess_window(given, known, delay)[0], given[..., self.obs_dim :]
         rows, now = th.arange(len(x), device=x.device), th.zeros_like(delay)
@@ -480,7 +481,7 @@ class InpaintingPlanner(nn.Module):
         alpha: float | th.Tensor,
         sigma: float | th.Tensor,
     ) -> th.Tensor:
-        """Return the prediction at noisy windows x: the prior's best, and what the network says that it is off by."""
+        """Return the prediction at noisy windows x: the prior's best one, plus its error as the network sees it."""
         if expected is None:
             return output
         best, off = diffusion.gaussian_prediction(x, *expected, alpha, sigma, prediction=self.config.prediction)
@@ -497,16 +498,16 @@ class InpaintingPlanner(nn.Module):
     def _trained_delay(self, delay: th.Tensor, action_history: th.Tensor) -> th.Tensor:
         """Return the delays to plan with: (B,) int64; with ``mask="fixed"`` D, at the start of an episode too.
 
-        :raises ValueError: for a younger observation amid an episode, which that mask was not trained for
+        :raises ValueError: with ``mask="fixed"``, for a younger observation amid an episode
         """
         if self.config.mask != "fixed":
             return delay
         older = th.arange(self.max_delay, device=delay.device) < self.max_delay - delay[:, None]  # (B, D)
-        amid = (action_history.ne(0).any(-1) & older).any(1)  # (B,): acted on longer ago than the observation is old
+        amid = (action_history.ne(0).any(-1) & older).any(1)  # (B,): an action was sent before the observation
         self.check_ages(delay[amid].tolist())
         return th.full_like(delay, self.max_delay)
 
 
 def _owner(value_fn: ValueFn) -> object:
-    """Return the object whose method a function is, or the function."""
+    """Return the object that a method is bound to; for any other function, itself."""
     return getattr(value_fn, "__self__", value_fn)

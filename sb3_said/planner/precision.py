@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager, nullcontext
 
 import torch as th
 
-#: Numbers in the activations; of fewer, on a CPU, the conversion to bfloat16 costs more than its products save
+#: Numbers in the activations: with fewer, on a CPU, the conversion to bfloat16 costs more time than it saves
 SMALL = 48 * 128
 
 

@@ -6,20 +6,20 @@ import torch as th
 from torch import nn
 
 LEAST_STD = 0.01  # of a guess that is never wrong; in the planner's units
-# Of an entry that moves with its guess. One that a guess hardly moves, as contact forces that are mostly 0, would have
-# any: 85,000 was met, where no entry of the tasks without such forces has above 8 (results/settings.md)
+# Where a guess hardly varies, as that of contact forces that are mostly 0, least squares gives any slope: 85,000 was
+# met, while no entry of the tasks without such forces has above 8 (results/settings.md)
 LARGEST_SLOPE = 10.0
-FEWEST_WINDOWS = 10  # that tell how far a guess is right; of one it looks as if it were never wrong
+FEWEST_WINDOWS = 10  # that can tell how far a guess is right; by one window it looks as if it were never wrong
 
 
 class Prior(nn.Module):
-    """Takes each entry of a window for a draw from N(slope * guess, std^2), delay by delay and step by step.
+    """Takes each entry of a window for a draw from N(slope * guess, std^2), fitted for each delay and step.
 
-    The network adds to the best prediction for that, in units of how far it is off. So a planner begins as good as its
-    guess, and hardly moves what the guess is sure of. It is the preconditioning of Karras et al. 2022
-    (https://arxiv.org/abs/2206.00364, section 5), which has a mean of 0 and one deviation for all.
+    The network corrects the best prediction for such a draw, in units of that prediction's error. So a planner begins
+    as good as its guess, and hardly changes what the guess is sure of. This is the preconditioning of Karras et al.
+    2022 (https://arxiv.org/abs/2206.00364, section 5), but there the mean is 0, and one deviation serves all entries.
 
-    Until :meth:`fit` it is N(0, 1), which changes nothing of a prediction of v.
+    Until :meth:`fit` the prior is N(0, 1), which leaves a prediction of v as it is.
 
     :param max_delay: D
     :param length: L, steps of the longest window
@@ -43,10 +43,10 @@ class Prior(nn.Module):
     def fit(self, delay: int, guess: th.Tensor, clean: th.Tensor, valid: th.Tensor) -> None:
         """Learn by least squares, within ``LARGEST_SLOPE``, how far guesses of one delay are right.
 
-        :param guess: (M, L, n_entries), as of the next two in the planner's units
-        :param clean: (M, L, n_entries), what they turned out to be
-        :param valid: (M, L) bool; steps that fewer windows than ``FEWEST_WINDOWS`` have stay as they are: one alone
-            lies on its own line, as if the guess were sure
+        :param guess: (M, L, n_entries), in the planner's units
+        :param clean: (M, L, n_entries), the true entries, in the same units
+        :param valid: (M, L) bool; a step that is valid in fewer windows than ``FEWEST_WINDOWS`` keeps its slope and
+            deviation: one window alone lies on its own line, as if the guess were sure
         """
         share = valid[..., None] / valid.sum(0).clamp(min=1)[:, None]  # (M, L, 1)
         slope = (share * guess * clean).sum(0) / (share * guess**2).sum(0).clamp(min=1e-12)
@@ -57,7 +57,7 @@ class Prior(nn.Module):
         self.std[delay] = th.where(is_seen, std, self.std[delay])
 
     def forward(self, guess: th.Tensor, delay: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Return mean and standard deviation of each entry: (B, L', n_entries), both.
+        """Return mean and standard deviation of each entry, both (B, L', n_entries).
 
         :param guess: (B, L', n_entries), L' at most L
         :param delay: (B,) int64

@@ -15,12 +15,12 @@ ValueFn = Callable[[th.Tensor, th.Tensor], th.Tensor]
 def score(
     value_fn: ValueFn, config: PlannerConfig, states: th.Tensor, actions: th.Tensor, delay: th.Tensor, shortest: int
 ) -> th.Tensor:
-    """Return the mean value of each candidate's steps that ``config.scored_states`` names: (B, N).
+    """Return the mean value of each candidate over the steps that ``config.scored_states`` names: (B, N).
 
     :param states: (B, N, L, obs_dim)
     :param actions: (B, N, L, act_dim)
     :param delay: (B,) int64, the indices of the decisions
-    :param shortest: a lower bound of the delays; for ``"future"``, steps up to there are not even valued
+    :param shortest: a lower bound of the delays; for ``"future"`` no step up to it is valued
     """
     if config.scored_states == "decision":
         rows = th.arange(len(states), device=states.device)

@@ -22,12 +22,12 @@ from sb3_said.planner.values import scaled_values, window_weight
 from sb3_said.planner.yardstick import RegressionYardstick
 from sb3_said.replay.windows import Windows, WindowSource
 
-HELD_OUT_WINDOWS = 1024  # per delay, in evaluate(): tells errors that differ by 2 % apart
+HELD_OUT_WINDOWS = 1024  # per delay, in evaluate(): enough to tell errors apart that differ by 2 %
 YARDSTICK_LEARNING_RATE = 1e-3
 N_NORMALIZER_WINDOWS = 10_000  # enough for a standard deviation to a percent
 N_PRIOR_WINDOWS = 1_000  # each is guessed at every age
-# Of the plain networks of a first guess, before the planner's: at most so many, so many for each of the planner's, and
-# so many passes over the data: a clone of few rows knows them by heart otherwise (results/make_train.md)
+# Limits on the updates of a first guess, which come before the planner's: in all, for each of the planner's, and in
+# passes over the data, since a clone would otherwise learn few rows by heart (results/make_train.md)
 GUESS_UPDATES, GUESS_UPDATES_EACH, GUESS_PASSES = 20_000, 5, 50
 
 
@@ -76,10 +76,10 @@ def seeded(seed: int) -> Iterator[None]:
 class PlannerTrainer:
     """Train a planner on windows of states and actions.
 
-    Gradient steps move the trainer's own weights (``online``); ``average`` holds their exponential moving average and
-    is what :meth:`evaluate` asks. Both start anew, whatever the planner has learned before: its weights would not go
-    with the normaliser of other data. The planner handed in answers as before until :meth:`hand_over`, which
-    :meth:`train` ends with. A small regression learns from the same batches, as the bar for the planner's errors.
+    Gradient steps move the trainer's own weights (``online``); ``average`` holds their exponential moving average,
+    which :meth:`evaluate` measures. Both start anew, whatever the planner has learned before: its weights would not fit
+    the normaliser of other data. The given planner answers as before until :meth:`hand_over`, which :meth:`train` calls
+    at its end. A small regression learns from the same batches, as the bar for the planner's errors.
 
     All draws come from the trainer's own generator. On the CPU a resumed run ends bit for bit as if it had never
     stopped; a GPU's sums do not repeat themselves exactly. A GPU holds the data, makes the draws, and runs each update
@@ -90,8 +90,8 @@ class PlannerTrainer:
     :param gradient_steps: updates of the whole training, over which a cosine learning rate falls to 0
     :param held_out: fraction of the data that is kept for ``evaluate``, see ``WindowSource.split``; 0 for none
     :param seed: of every draw
-    :param older: windows of other steps, of which the first guess's model learns, too
-    :param guess_steps: steps that this model learns at once at last, in place of single ones
+    :param older: windows of older steps, from which the first guess's model learns, too
+    :param guess_steps: steps that this model learns at once in the last part of its training; 1 for no such part
     :raises ValueError: when ``source`` does not fit the planner, or cannot be split
     """
 
@@ -135,7 +135,7 @@ class PlannerTrainer:
         values = scaled_values(training_source.values, self.config.value_scale)
         self.source = replace(training_source, values=values).to(self.device)
         self.older = older
-        self.guess_steps = guess_steps  # of no setting above: no update after the first reads it
+        self.guess_steps = guess_steps  # none of the settings above: it is read before the first update alone
         self._has_guess = False
         self._is_own = self.config.mask == "own" and source.ages is not None
         sizes = planner.obs_dim, planner.act_dim, planner.max_delay
@@ -160,7 +160,7 @@ class PlannerTrainer:
         self._optimizers = {"optimizer": self.optimizer, "yardstick_optimizer": self.yardstick_optimizer}
         self._averaged: list[th.Tensor] = list(self.average.network.parameters())
         self._online: list[th.Tensor] = list(self.online.network.parameters())
-        # Read at log times only: a read per update would make a GPU wait for it.
+        # Read at log times only: a read at each update would wait for the GPU each time
         self._loss_sums = th.zeros(2, device=self.device)
         self._n_losses = 0
         self._bad_update = th.full((), -1, device=self.device)
@@ -170,7 +170,7 @@ class PlannerTrainer:
     def step(self) -> None:
         """Make one update.
 
-        :raises FloatingPointError: when an update was not finite (looked at every 100 updates)
+        :raises FloatingPointError: when an update was not finite (checked every 100 updates)
         """
         self.make_first_guess()
         rate = learning_rate(self.n_updates, self.gradient_steps, self.config)
@@ -190,16 +190,16 @@ class PlannerTrainer:
             self._check_finite()
 
     def make_first_guess(self, progress_bar: bool = False, should_stop: Callable[[], bool] | None = None) -> bool:
-        """Train what makes the planner's first guess, which stays as it is from then on; the first update does.
+        """Train the networks of the first guess, which then stay as they are; the first update calls this.
 
         :param progress_bar: show one
-        :param should_stop: asked after every update; where it says so, this trainer is of no use any more
-        :return: whether there is one, or none is asked for; False where ``should_stop`` has ended it
+        :param should_stop: asked after every update; once it has ended this, the trainer is of no use any more
+        :return: False where ``should_stop`` has ended it, else True
         """
-        guess, older, self.older = self.online.first_guess, self.older, None  # older: another copy of the replay
+        guess, older, self.older = self.online.first_guess, self.older, None  # older may copy the replay: free it
         if guess is None or self._has_guess:
             return True
-        guess.requires_grad_(True)  # which one that was taken back has not
+        guess.requires_grad_(True)  # it is frozen if load_state_dict has gone back to before the first update
         passes = -(-GUESS_PASSES * len(self.source) // GUESS_BATCH_SIZE)
         n_updates = min(GUESS_UPDATES, GUESS_UPDATES_EACH * self.gradient_steps, passes)
         if not fit_first_guess(
@@ -219,7 +219,7 @@ class PlannerTrainer:
         return True
 
     def take_first_guess(self, other: InpaintingPlanner) -> None:
-        """Take over what makes a trained planner's first guess, which has learned from the same data."""
+        """Take over the first guess of a trained planner, which has learned from the same data."""
         guess, others = self.online.first_guess, other.first_guess
         if guess is None or others is None or self.n_updates > 0:
             return
@@ -228,7 +228,7 @@ class PlannerTrainer:
         self._settle_first_guess()
 
     def _settle_first_guess(self) -> None:
-        """Learn how far the guess is right, and let nothing change it any more."""
+        """Freeze the first guess, and learn how far it is right."""
         assert self.online.first_guess is not None  # it was just made
         self.online.first_guess.requires_grad_(False)
         if len(self.source) > N_PRIOR_WINDOWS:
@@ -241,7 +241,7 @@ class PlannerTrainer:
         self._has_guess = True
 
     def _descend(self) -> tuple[th.Tensor]:
-        """Draw a batch, move both sets of weights, and return both losses, (2,), without waiting for the device."""
+        """Draw a batch, update planner and regression, and return their losses, (2,). Never wait for the device."""
         config = self.config
         for optimizer in self._optimizers.values():
             optimizer.zero_grad()
@@ -257,7 +257,7 @@ class PlannerTrainer:
             th.nn.utils.clip_grad_norm_(self._online, config.gradient_clip)
         self.optimizer.step()
 
-        if config.mask == "none":  # the regression has no guess, and meets every age itself
+        if config.mask == "none":  # the regression has no guess, so it has to meet every age itself
             delay = self._draw_delays("random")
         windows = windows._replace(states=self.average.normalizer.normalize_states(windows.states))
         yardstick_loss = self.yardstick.loss(windows, delay, weight)
@@ -334,7 +334,7 @@ class PlannerTrainer:
                 "settings": self._settings,
                 "n_updates": self.n_updates,
                 **{name: dict(module.state_dict()) for name, module in self._modules.items()},
-                # Of optimizers the state alone: their groups hold nothing but settings
+                # No optimizer's groups: they hold nothing but settings
                 **{name: optimizer.state_dict()["state"] for name, optimizer in self._optimizers.items()},
                 "generator": self.generator.get_state(),
                 "loss_sums": self._loss_sums,
@@ -345,7 +345,7 @@ class PlannerTrainer:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue where ``state_dict`` was taken.
 
-        :raises ValueError: when that training had other settings, so that the end would be neither's
+        :raises ValueError: when that training had other settings, or its state is not one that a training can have
         """
         advice = "Resume with the settings and data that it began with, or start a new training."
         check_same("The stored training was begun", state["settings"], self._settings, advice)
@@ -364,7 +364,7 @@ class PlannerTrainer:
         drawn = state["generator"].cpu()
         if len(drawn) == len(self.generator.get_state()):
             self.generator.set_state(drawn)
-        else:  # of another kind of device; not the draws of the beginning again
+        else:  # it is of another kind of device: a new seed, so as not to repeat the first draws
             self.generator.manual_seed(self._settings["seed"] + self.n_updates)
         self._loss_sums.copy_(state["loss_sums"])
         self._n_losses = state["n_losses"]
@@ -379,7 +379,7 @@ class PlannerTrainer:
     def _check_finite(self) -> None:
         bad = int(self._bad_update)
         if bad < 0 and not th.nn.utils.get_total_norm(self._averaged).isfinite():
-            bad = self.n_updates - 1  # its gradient, and no loss came after it
+            bad = self.n_updates - 1  # a bad gradient, which no later loss has shown yet
         if bad >= 0:
             raise FloatingPointError(
                 f"Update {bad} (of {self.gradient_steps}) of the planner was not finite; the planner stays as it was. "

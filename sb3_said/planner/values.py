@@ -25,10 +25,11 @@ def returns_to_go(
     :param gamma: discount factor
     :param terminal_penalty: replaces the reward of a terminating step (paper, Table 3); None keeps it
     :param value_fn: (states (K, obs_dim), actions (K, act_dim)) -> (K,), the value of the last stored step of an
-        episode that was cut off. Without it an episode is taken to go on at its average reward, of which one shorter
-        than the horizon 1 / (1 - gamma) takes what it lacks from all: a step of a log's end tells little
+        episode that was cut off. Without it such an episode is taken to go on at its average reward. In the average of
+        an episode shorter than the horizon 1 / (1 - gamma), the mean reward of all steps that do not terminate stands
+        for the missing ones: few steps tell little
     :return: (M,) float32
-    :raises ValueError: for gamma = 1 without ``value_fn`` where an episode was cut off, and so has no finite value
+    :raises ValueError: for gamma = 1 without ``value_fn`` where an episode was cut off: it has no finite value
     """
     rewards = source.rewards[source.rows, source.envs].clone()  # (M,)
     terminated, last = source.terminated[source.rows, source.envs], source.remaining == 1
@@ -63,9 +64,9 @@ def scaled_values(values: th.Tensor, scale: str) -> th.Tensor:
     """Map values to V of the weight exp(beta (V - 1)), which is at most 1.
 
     :param values: (M,)
-    :param scale: ``"rank"``, the part of the others that a value is above, equal ones counted half; ``"range"``, the
+    :param scale: ``"rank"``, the part of the others that lie below a value, equal ones counted half; ``"range"``, the
         place between the lowest and the highest, in [0, 1]; ``"centred"``, the same place in [-1, 1], as in the code
-        under the paper's results (DV), where beta counts twice as much. The last two give ones where all are equal
+        under the paper's results (DV), so that beta counts twice as much. The last two give 1 where all are equal
     """
     if scale != "rank":
         low, high = values.min(), values.max()

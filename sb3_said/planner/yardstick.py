@@ -13,8 +13,8 @@ from sb3_said.replay.windows import Windows
 class RegressionYardstick(nn.Module):
     """Multi-layer perceptron from (s_{t-d}, the d actions since, d) to (s_t, a_t).
 
-    A generative planner should know the present at least as well as this small network. One that does not is trained
-    too little, or wrong, whatever its return.
+    A generative planner should know the present at least as well as this small network. A planner that does not is
+    trained too little, or wrongly, whatever its return.
 
     :param max_delay: D, the largest delay
     :param hidden: width of the two hidden layers

@@ -1,4 +1,4 @@
-"""Control loops of robots: observations when they come, an action every period, answers when they are made."""
+"""Control loops of robots: they take observations and answers when these come, and send an action every period."""
 
 from sb3_said.realtime.ledger import NoAnswer
 from sb3_said.realtime.loop import ControlLoop

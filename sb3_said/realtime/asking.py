@@ -1,4 +1,4 @@
-"""How a loop asks a model: the observation that the wrapper would give, and as long a plan as the model has."""
+"""How a loop asks a model: with the observation that the wrapper would give, for as long a plan as it makes."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from sb3_said.realtime.ledger import Request
 
 @dataclass(frozen=True)
 class Asking:
-    """Asks a model; what it holds is as of :class:`~sb3_said.realtime.ControlLoop`."""
+    """Asks a model; fields without a docstring are as in :class:`~sb3_said.realtime.ControlLoop`."""
 
     model: Any
     max_delay: int
-    """D, that the model was built for"""
+    """D, the largest age that the model was built for"""
     deterministic: bool
     normalize: Callable[[Any], Any] | None
 
@@ -40,7 +40,7 @@ class Asking:
                 "action_history": request.history[None],
                 "delay": np.array([[request.age]], np.float32),
             }
-            if has_state_history(self.model.observation_space):  # none is known that is younger, and no other is read
+            if has_state_history(self.model.observation_space):  # no younger state is known, and no older one is read
                 shape = (1, self.max_delay)
                 observation["state_history"] = np.zeros((*shape, *request.observation.shape), np.float32)
                 observation["state_known"] = np.zeros(shape, np.float32)
@@ -54,22 +54,22 @@ class Asking:
         return within_bounds(actions, space), seconds
 
     def warm_up(self) -> float:
-        """Run dummy answers until one takes no longer than later ones, and return the seconds that it took."""
+        """Let the model answer dummy requests until it is warm, and return the seconds of a warm answer."""
         space = self.model.observation_space
         state_shape = (space["observation"] if isinstance(space, spaces.Dict) else space).shape or ()
         history = np.zeros((self.max_delay, *self.model.action_space.shape), np.float32)
         dummy = Request(-1, 0, 0, 0, np.zeros(state_shape, np.float32), history, self.max_delay)
         if hasattr(self.model, "warmup"):
             self.model.warmup()
-        self.answer(dummy)  # a ModelProcess has a warmup() whatever its model has
+        self.answer(dummy)  # a ModelProcess has a warmup() even if its model has none
         return self.answer(dummy)[1]
 
 
 def plan_of(model: Any, observation: Any, deterministic: bool) -> np.ndarray:
-    """Return a plan for each observation of a batch: (B, K, act_dim), of one action where a model does not plan.
+    """Return a plan for each observation of a batch: (B, K, act_dim). K is 1 for a model that does not plan.
 
-    :raises ValueError: for a model with a memory, whose answer depends on the answers before, and for an answer that is
-        not of a batch
+    :raises ValueError: for a model with a memory, whose answers depend on earlier ones, and for an answer that is not
+        of a batch
     """
     if hasattr(model, "predict_plan"):
         return np.asarray(model.predict_plan(observation, deterministic=deterministic))

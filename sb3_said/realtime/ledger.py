@@ -1,4 +1,4 @@
-"""A loop's memory, without clock or thread: what was sent, seen and planned, by the number of actions.
+"""A loop's memory, without clock or thread: what was sent, seen and planned, counted in actions.
 
 Actions are numbered from 0 in every episode; action k leads from state k to state k + 1.
 """
@@ -19,26 +19,26 @@ from sb3_said.realtime.statistics import LARGEST_COUNTED
 
 
 class NoAnswer(RuntimeError):
-    """No action was planned for longer than holding and the safe action may bridge."""
+    """No action was planned for longer than ``hold_steps`` and ``safe_steps`` allow."""
 
 
 class Request(NamedTuple):
     """What a model is asked, and for which action."""
 
     era: int
-    """as of the ledger; an answer of another one is of no use"""
+    """the ledger's at that time; an answer of an earlier era is dropped"""
     n_seen: int
-    """observations taken before it is asked"""
+    """observations taken when it is asked"""
     n_sent: int
     """actions sent when it is asked"""
     target: int
-    """number of the action that it is asked for"""
+    """number of the action that its answer begins with"""
     observation: np.ndarray
     """(obs_dim,) float32, the newest"""
     history: np.ndarray
-    """(D, act_dim) float32, the actions before the target, those that will be sent meanwhile included"""
+    """(D, act_dim) float32, in [-1, 1], the actions before the target, with those still to be sent until then"""
     age: int
-    """how many of these do not show in the observation"""
+    """how many of these actions do not show in the observation"""
 
 
 class Step(NamedTuple):
@@ -58,9 +58,9 @@ class Ledger:
     :param period: from one action to the next, in the unit of the stamps
     :param max_delay: D, largest age that the model reads
     :param max_age: largest age of an observation to act on
-    :param action_delay: from sending an action to its effect, in that unit
+    :param action_delay: from sending an action to its effect, in the same unit
     :param hold_steps: steps in a row to repeat the last action
-    :param safe_action: (act_dim,), sent after that, and at first
+    :param safe_action: (act_dim,), sent after ``hold_steps``, and until the first answer
     """
 
     def __init__(
@@ -78,14 +78,14 @@ class Ledger:
         self.period, self.action_delay = period, action_delay
         self.max_delay, self.max_age = max_delay, max_age
         self.hold_steps, self.safe_action = hold_steps, safe_action
-        self.era = -1  # ends with an episode, and where what was planned is discarded
+        self.era = -1  # a new one begins with each episode, and when a plan is discarded
         self.start_episode(math.nan)
 
     def start_episode(self, began: float) -> None:
-        """Forget all; observations captured before ``began``, NaN if unknown, are of another episode."""
+        """Forget all. Observations captured before ``began`` (NaN if unknown) are of another episode."""
         self.era += 1
         self.n_sent = self.n_missing = self.n_seen = 0
-        self.begins_on = 0  # n_seen of the answer that begins the episode
+        self.begins_on = 0  # n_seen of the newest answer that begins at action 0
         self.is_answered = False
         self.observation: np.ndarray | None = None
         self.captured, self._n_shown, self._is_stamped = began, 0, True
@@ -109,7 +109,7 @@ class Ledger:
         :param capture_time: when it was captured; None if unknown
         :param n_executed: how many actions show in it; by default those that had acted for more than half a period at
             ``capture_time``, so that an age is rounded to the nearest
-        :param latest: time of the latest capture that can be; NaN if unknown
+        :param latest: latest possible time of a capture; NaN if unknown
         :raises ValueError: for what is no state, or for more actions than were sent
         """
         state = np.array(observation, np.float32)
@@ -136,30 +136,30 @@ class Ledger:
                 f"The observation says that {n_executed} actions were executed, but {self.n_sent} were sent since "
                 "reset(); reset the robot's count, too, and drop observations of the episode before."
             )
-        n_executed = int(n_executed)  # numbers of a packet are NumPy's, and those of few bits overflow
+        n_executed = int(n_executed)  # a packet may hold NumPy integers of few bits, which overflow
         if n_executed < self._n_shown and (capture_time is None or not self._is_stamped):
             return False
         if capture_time is not None:
             self.captured = capture_time
         elif n_executed == self._n_shown < self.n_sent and np.array_equal(state, self.observation):  # type: ignore[arg-type]
-            return False  # a frozen sensor; a robot that has executed all may as well stand still
+            return False  # a frozen sensor; once all is executed, a robot may well stand still
         self.observation, self._n_shown, self._is_stamped = state, n_executed, capture_time is not None
         self.n_seen += 1
         return True
 
     def turn_back(self, now: float, expected: float) -> None:
-        """Go on with a clock that went back: what was sent took effect as long ago as it had.
+        """Go on after a clock went back: move all effects to the new time, as long ago as they were.
 
-        :param now: in the new time
-        :param expected: what this moment would be in the time before; NaN before the first action
+        :param now: this moment, in the new time
+        :param expected: this moment, in the old time; NaN before the first action
         """
         self.captured = now
         self._effects = deque((effect + now - expected for effect in self._effects), self._effects.maxlen)
 
     def request(self, n_steps: int) -> Request | None:
-        """Return what to ask for the action to send in ``n_steps`` steps; None where no observation is young enough.
+        """Return the request for the action to send in ``n_steps`` steps; None if no observation is young enough.
 
-        If the model does not read ages that large, it is asked for an earlier action.
+        If the age would be larger than the model reads, the request is for an earlier action.
         """
         if self.observation is None or self.age > self.max_age:
             return None
@@ -169,12 +169,12 @@ class Ledger:
             coming = np.stack([step.action for step in self._coming(n_steps)])
             scaled = scale_action(coming, self.action_space).astype(np.float32)
             history = np.concatenate([history, scaled])[-self.max_delay :]
-        observation, history = self.observation.copy(), history.copy()  # which whoever is asked may change
+        observation, history = self.observation.copy(), history.copy()  # the model may change its copies
         target = self.n_sent + n_steps
         return Request(self.era, self.n_seen, self.n_sent, target, observation, history, self.age + n_steps)
 
     def splice(self, actions: np.ndarray, target: int) -> int:
-        """Plan actions from a number on, in place of what was planned there.
+        """Plan actions from a number on, in place of all that was planned from there on.
 
         :param actions: (K, act_dim), in the units of the action space
         :param target: number of the first of them
@@ -184,7 +184,7 @@ class Ledger:
         self._planned = {number: action for number, action in self._planned.items() if number < target}
         self._planned |= {target + k: action for k, action in enumerate(actions) if target + k >= self.n_sent}
         n_late = max(self.n_sent - target, 0)
-        if n_late >= len(actions):  # still newer than what was sent last
+        if n_late >= len(actions):  # all too late, but still newer than what was sent last
             self._last, self.n_missing = actions[-1], n_late - len(actions)
         return n_late
 
@@ -193,9 +193,9 @@ class Ledger:
         return number in self._planned
 
     def next_step(self) -> Step:
-        """Return what to send next. An observation that is too old discards what is planned.
+        """Return what to send next. If the observation is too old, all that is planned is discarded.
 
-        An answer that is on its way was told that it would be sent, and is discarded, too.
+        A request on its way has those actions in its history, so its answer is discarded, too.
         """
         if self._planned and self.observation is not None and self.age > self.max_age:
             self._planned.clear()
@@ -203,7 +203,7 @@ class Ledger:
         return next(self._coming(1))
 
     def send(self, step: Step, now: float) -> None:
-        """Note what was sent at a time."""
+        """Note that a step was sent at the time ``now``."""
         self._planned.pop(self.n_sent, None)
         self._last, self.n_missing = step
         self._history = np.concatenate([self._history, scale_action(step.action, self.action_space)[None]], axis=0)
@@ -212,7 +212,7 @@ class Ledger:
         self.n_sent += 1
 
     def _coming(self, n_steps: int) -> Iterator[Step]:
-        """Yield what the next steps will send, unless another answer or a too old observation comes between."""
+        """Yield what the next steps will send, unless an answer arrives or the observation gets too old before."""
         action, n_missing = self._last, self.n_missing
         for number in range(self.n_sent, self.n_sent + n_steps):
             if number in self._planned:

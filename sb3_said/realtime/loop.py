@@ -1,4 +1,4 @@
-"""A control loop that counts its own time: sensors deliver when they do, answers take their time, both are delay."""
+"""A control loop that counts its own delay: old observations and slow answers both add to it."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from sb3_said.realtime.asking import Asking
 from sb3_said.realtime.ledger import Ledger, NoAnswer, Request
 from sb3_said.realtime.statistics import LoopStatistics
 
-#: Newest answers that tell how many steps the next one will take, and the share of them that this covers.
+#: How many answers are remembered, and the part of them that the expected number of steps covers.
 ANSWERS_REMEMBERED, ANSWERS_COVERED = 100, 0.95
-#: A stamp more periods ahead of now than the first is refused; further away than the second, it is of another clock.
+#: A stamp more than AHEAD periods ahead of now is refused. One more than FAR periods away is of another clock.
 AHEAD, FAR = 2, 100
 
 
@@ -28,15 +28,16 @@ class ControlLoop:
     """Runs a model against a robot: observations come in from any thread, an action goes out every period.
 
     :meth:`act` never blocks. A worker thread asks the model whenever an observation arrives, and once a period if none
-    does. An observation of age a, with an answer expected n steps later, is planned at the age a + n, with the n
-    actions that will be sent meanwhile already in its history. When an answer is due is counted in actions sent, never
-    timed: it begins at the action that it was planned for. If that one has been sent already, the plan's later actions
-    serve. A model plans later actions if it has ``predict_plan``, as :class:`~sb3_said.SAID` does; of any other, an
-    answer is one action.
+    does. If the observation has age a and the answer is expected n steps later, the model plans at age a + n. Its
+    action history then ends with the n actions that will be sent meanwhile. Answers are placed by counting actions,
+    never by time: an answer begins at the action that it was planned for. If that action has been sent already, the
+    plan's later actions are used. A model with ``predict_plan``, such as :class:`~sb3_said.SAID`, plans later actions;
+    any other model answers with one action.
 
     Where no action is planned, the last one is held for ``hold_steps``, then ``safe_action`` is sent for
-    ``safe_steps``, then ``act`` raises :class:`NoAnswer`. An observation older than ``max_age`` discards what is
-    planned. Until an episode's first answer the safe action is sent, for as long.
+    ``safe_steps``, then ``act`` raises :class:`NoAnswer`. Once the observation is older than ``max_age``, all
+    that is planned is discarded. Until an episode's first answer, the safe action is sent for up to ``hold_steps`` plus
+    ``safe_steps`` steps.
 
     Python runs one thread at a time. Where ``act`` must not wait for the few milliseconds that a model computes in
     Python, give the model a process of its own: :class:`~sb3_said.realtime.ModelProcess`.
@@ -44,19 +45,19 @@ class ControlLoop:
     :param model: anything with ``predict``, ``observation_space`` and ``action_space`` of Stable-Baselines3, without a
         memory between its answers
     :param period: of ``act``, in seconds; with ``simulate`` in the unit of ``now``
-    :param answer_steps: n, steps that an answer will take; by default what 95 % of the newest 100 took
+    :param answer_steps: n, steps that an answer will take; by default as many as cover 95 % of the newest 100
     :param action_delay: from ``act`` to the moment that the action takes effect, in the unit of ``now``
     :param max_age: largest age of an observation to act on, in steps; the model's largest delay by default
     :param hold_steps: steps in a row to repeat the last action, >= 0; None for no limit
     :param safe_action: (act_dim,), in the units of the action space; the middle of its bounds by default
-    :param safe_steps: steps in a row to send it, >= 0; None for no limit
+    :param safe_steps: steps in a row to send the safe action, >= 0; None for no limit
     :param deterministic: handed to the model
     :param normalize: applied to batched observations before the model, such as ``VecNormalize.normalize_obs``
-    :param count_latency: False for a loop that ignores how long answers take, to compare with: it plans for the step at
-        which it asks, and sends one action when the answer arrives
-    :param simulate: makes the loop deterministic, without a thread. The model is asked inside ``act``, whenever it is
-        not busy, and is busy for ``simulate(seconds)`` steps, where ``seconds`` is what it took: ``lambda seconds: 0``
-        gives answers for free
+    :param count_latency: False for a loop to compare with, which ignores how long answers take: it plans for the step
+        at which it asks, and sends one action when the answer arrives
+    :param simulate: runs the loop without a thread, so that it can be deterministic. ``act`` asks the model whenever it
+        is not busy. An answer that took ``seconds`` keeps it busy for ``simulate(seconds)`` steps; with
+        ``lambda seconds: 0`` answers take no time
     :raises ValueError: for a model or a setting that does not fit
 
     >>> loop = ControlLoop(model, period=0.02)  # doctest: +SKIP
@@ -88,7 +89,7 @@ class ControlLoop:
                 "normalize=lambda obs: obs where they are so already."
             )
         self._asking = Asking(model, max_delay, deterministic, normalize)
-        period, action_delay = float(period), float(action_delay)  # a float32 would round the times of a clock
+        period, action_delay = float(period), float(action_delay)  # a float32 period would round the times of a clock
         if not (period > 0 and action_delay >= 0):
             raise ValueError(f"period is {period} and action_delay {action_delay}, expected above 0 and at least 0.")
         counts = {"answer_steps": answer_steps, "max_age": max_age, "hold_steps": hold_steps, "safe_steps": safe_steps}
@@ -100,7 +101,7 @@ class ControlLoop:
                 f"max_age is {max_age}, but the model reads ages 0..{max_delay}; train it with a larger max_delay."
             )
         safe = unscale_action(np.zeros(space.shape), space) if safe_action is None else np.asarray(safe_action)
-        # Before a cast to whole numbers, in which 300 may be 44
+        # Checked before a cast to whole numbers, in which 300 may become 44
         if safe.shape != space.shape or not np.all((space.low <= safe) & (safe <= space.high)):
             raise ValueError(f"safe_action is {safe_action}, expected an action of {space}.")
         safe = within_bounds(safe, space)
@@ -111,21 +112,21 @@ class ControlLoop:
         self._answer_steps_given = answer_steps is not None
         self._took: deque[int] = deque(maxlen=ANSWERS_REMEMBERED)
 
-        # All that follows is read and written under this lock. Nobody holds it while a model computes, but for a
+        # All that follows is read and written under this lock. Nobody holds it while a model computes, except in a
         # simulation.
         self._changed = threading.Condition(threading.Lock())
         hold = math.inf if hold_steps is None else hold_steps
         max_age = max_delay if max_age is None else max_age
         self._ledger = Ledger(state_space, space, period, max_delay, max_age, action_delay, hold, safe)
         self._statistics = LoopStatistics()
-        self._acted = self._offset = math.nan  # when, and how far that clock is ahead of the monotonic one
-        self._is_closing = self._has_heard = self._has_warned = False  # an observation since the last act
-        self._is_busy, self._n_answers = True, 0  # a simulation's worker is never idle
-        self._is_due = False  # to ask a busy worker when it has answered
-        self._asked: Request | None = None  # what an idle one is asked
-        self._stands = False  # the robot, until the answer that is waited for or that was missed
+        self._acted = self._offset = math.nan  # time of the last act, and its clock's lead over the monotonic one
+        self._is_closing = self._has_heard = self._has_warned = False  # has heard: of an observation since the last act
+        self._is_busy, self._n_answers = True, 0  # a simulation has no worker that becomes idle
+        self._is_due = False  # whether to ask a busy worker once it has answered
+        self._asked: Request | None = None  # what an idle worker is asked
+        self._stands = False  # whether the robot stands still until an answer comes
         self._error: BaseException | None = None
-        self._in_flight: tuple[Request, np.ndarray, int] | None = None  # of a simulation, and when it arrives
+        self._in_flight: tuple[Request, np.ndarray, int] | None = None  # a simulation's answer, and its arrival
         if simulate is not None:
             self._warm_up()
             return
@@ -141,12 +142,12 @@ class ControlLoop:
 
     @property
     def n_sent(self) -> int:
-        """Actions sent in this episode; with ``n_executed``, the number to send along with the newest."""
+        """Actions sent in this episode, and so the number of the newest, which a robot returns as ``n_executed``."""
         return self._ledger.n_sent
 
     @property
     def safe_action(self) -> np.ndarray:
-        """What is sent where nothing better is known: (act_dim,), in the units of the action space."""
+        """The action that is sent where no better one is known: (act_dim,), in the units of the action space."""
         return self._ledger.safe_action.copy()
 
     def statistics(self) -> LoopStatistics:
@@ -157,8 +158,8 @@ class ControlLoop:
     def reset(self, now: float | None = None) -> None:
         """Begin an episode: nothing has been sent, seen or planned.
 
-        :param now: observations captured before are of another episode, and are dropped. ``time.monotonic()`` by
-            default; in a simulation none is dropped by default
+        :param now: observations captured before it are of another episode, and are dropped. ``time.monotonic()`` by
+            default; in a simulation nothing is dropped by default
         :raises ValueError: for what is no time
         """
         with self._changed:
@@ -174,16 +175,16 @@ class ControlLoop:
         """Take an observation, from any thread; one that is no younger than the one at hand is dropped.
 
         Its age is the number of the newest actions that do not show in it: those that had acted for half a period or
-        less at its capture. Stamps and ``now`` must be of one clock. What is stamped more than two periods ahead of now
-        is dropped, too, since it would make all that follows look old. The first such stamp, or one far behind, is
-        warned of.
+        less at its capture. Stamps and ``now`` must be of one clock. An observation stamped more than two periods ahead
+        of now is dropped, too, since it would make all later ones look old. The first stamp that is so far ahead, or
+        far behind, is warned of.
 
         :param observation: (obs_dim,), in the units of the task; copied
-        :param capture_time: when it was captured. The same stamp twice is a sensor that froze: its observation ages. By
+        :param capture_time: when it was captured. A repeated stamp means a frozen sensor, whose observation ages. By
             default ``time.monotonic()``, unless ``n_executed`` is given
-        :param n_executed: number of the newest action that shows in it, 0 before the first: of a robot that reads its
-            sensors and then executes a command, the number of the one before. It counts better than a stamp, since no
-            command's time on its way has to be known
+        :param n_executed: number of the newest action that shows in it, 0 before the first. A robot that reads its
+            sensors before it executes a command gives the number of the command before. This number is better than a
+            stamp, since nobody needs to know how long a command is on its way
         :raises ValueError: for what is no finite observation, or for more actions than were sent
         """
         if capture_time is None and n_executed is None:
@@ -217,7 +218,7 @@ class ControlLoop:
         :raises ValueError: for what is no time, or where stamps and the first ``now`` are of different clocks
         """
         with self._changed:
-            clock = time.monotonic()  # and not before: another thread may hold the lock for a while
+            clock = time.monotonic()  # only now: another thread may have held the lock for a while
             now = _time(now, clock)
             self._check()
             if (ahead := (self._ledger.captured - now) / self.period) > AHEAD:
@@ -231,14 +232,14 @@ class ControlLoop:
                 self._pretend(self._simulate)
             step = self._ledger.next_step()
             if step.n_missing > self._max_missing:
-                self._stands = True  # until an action is sent: answers are to begin with that one
+                self._stands = True  # until the next action is sent, with which answers are to begin
                 self._ask()
                 raise NoAnswer(f"No action was planned for {step.n_missing} steps. Counted so far: {self._statistics}")
             self._count(step.n_missing, now)
             self._ledger.send(step, now)
             is_planned = self._ledger.is_planned(self.n_sent + self.answer_steps)
             if not (self._has_heard and (self._is_busy or self._asked or is_planned)):
-                self._ask()  # again: the same observation is a step older
+                self._ask()  # again, as the same observation is a step older now
             self._has_heard = self._stands = False
             self._note(now, clock)
             return step.action.copy()
@@ -246,8 +247,8 @@ class ControlLoop:
     def wait(self, timeout: float | None = None) -> bool:
         """Block until the model has answered what has come so far, and tell whether it has.
 
-        Before the first action of an episode the robot stands, so that no action is sent meanwhile: then the answer
-        that this waits for, to the newest observation, begins with that one.
+        Before the first action of an episode the robot stands still and no action is sent meanwhile. So the answer to
+        the newest observation begins with that first action.
 
         :param timeout: in seconds; None for no limit
         :raises RuntimeError: where the model has failed, or the loop is closed
@@ -269,9 +270,9 @@ class ControlLoop:
             return is_answered
 
     def close(self, timeout: float | None = 5.0) -> None:
-        """Stop the worker, once it has made the answer that it is making.
+        """Stop the worker, after the answer that it is making.
 
-        :param timeout: seconds to wait for it; a model that hangs for longer is left alone, and ends with the program
+        :param timeout: seconds to wait for it; a model that hangs longer is left alone, and ends with the program
         """
         with self._changed:
             self._is_closing = True
@@ -280,7 +281,7 @@ class ControlLoop:
             self._worker.join(timeout)
 
     def _wait(self, ends: float | None) -> bool:
-        enough = self._n_answers + 2  # the worker may never be idle; the second one it will have begun after this
+        enough = self._n_answers + 2  # a worker that is never idle begins its second answer from now after this call
 
         def is_over() -> bool:
             has_stopped = self._is_closing or self._error is not None
@@ -292,13 +293,14 @@ class ControlLoop:
 
     def _note(self, now: float, clock: float) -> None:
         self._acted = now
-        if self._simulate is None:  # else time goes on in act alone
+        if self._simulate is None:  # in a simulation time passes in act alone
             self._offset = now - clock
 
     def _ask(self) -> None:
         """Say what an idle worker is asked; a busy one will be asked when it has answered.
 
-        Not when it wakes: by then an action may have been sent, and the observation be a step too old.
+        The request is made here and not when the worker wakes: by then an action may have been sent, and the
+        observation be a step too old.
         """
         self._is_due = self._is_busy
         if not self._is_busy:
@@ -328,7 +330,7 @@ class ControlLoop:
             counted.count_gap((now - self._acted) / self.period)
 
     def _work(self) -> None:
-        """Answer until closed: the worker's thread."""
+        """Answer until the loop is closed, in the worker's thread."""
         try:
             self._warm_up()
             while True:
@@ -346,18 +348,18 @@ class ControlLoop:
                 with self._changed:
                     self._take(request, actions)
                     self._n_answers += 1
-        except BaseException as error:  # act raises it where the robot is
+        except BaseException as error:  # act raises it, in the thread of the robot
             with self._changed:
                 self._error, self._is_busy = error, False
                 self._changed.notify_all()
 
     def _pretend(self, busy_steps: Callable[[float], int], waits: bool = False) -> None:
-        """Be a worker that is busy for some steps, at the moment before an action is sent.
+        """Do what a worker that is busy for some steps would have done before the next action is sent.
 
-        :param waits: whether the robot waits for its answers
+        :param waits: whether the robot stands still and waits for the answer
         """
         for may_ask in (True, False):
-            # While the robot stands no step goes by, by which an answer could be waited for
+            # While the robot stands still, no steps are counted: the answer arrives at once
             is_there = waits or self._stands
             if self._in_flight is not None and (is_there or self._in_flight[2] <= self.n_sent):
                 request, actions, _ = self._in_flight
@@ -370,11 +372,11 @@ class ControlLoop:
                     self._in_flight = asked, actions, self.n_sent + int(busy_steps(seconds))
 
     def _take(self, request: Request, actions: np.ndarray) -> None:
-        """Splice an answer in, unless it is of an episode that has ended, or of a plan that was discarded."""
+        """Splice an answer in, unless its episode has ended or the plan in its history was discarded."""
         ledger = self._ledger
         if request.era != ledger.era:
             return
-        if ledger.n_sent > 0 and not self._stands:  # else no step goes by however long an answer takes
+        if ledger.n_sent > 0 and not self._stands:  # else no steps are counted, however long an answer takes
             took = ledger.n_sent - request.n_sent
             self._statistics.count_answer(took)
             self._took.append(took)
@@ -391,7 +393,7 @@ class ControlLoop:
             self.answer_steps = answer_steps
 
     def _warm_up(self) -> None:
-        """Make the first answer take no longer than later ones, and expect it to take as long."""
+        """Warm the model up, and expect its first answer to take as long as a warm one."""
         seconds = self._asking.warm_up()
         self._expect(math.ceil(seconds / self.period) if self._simulate is None else int(self._simulate(seconds)))
 

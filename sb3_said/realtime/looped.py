@@ -1,4 +1,4 @@
-"""A model that answers through a control loop, so that whatever plays models measures what latency costs them."""
+"""A model that answers through a control loop, so that its evaluation measures what latency costs it."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from sb3_said.realtime.loop import ControlLoop
 class LoopedModel:
     """Plays one environment through a loop, with the ``predict`` of Stable-Baselines3.
 
-    The environment may be delayed: then the age that its wrapper counts tells the loop how many actions were executed.
+    If the environment is delayed, the age that its wrapper counts tells the loop how many actions were executed.
 
-    :param loop: with ``simulate``, which counts in steps
+    :param loop: made with ``simulate``, so that time is counted in steps
     """
 
     def __init__(self, loop: ControlLoop):
@@ -25,7 +25,7 @@ class LoopedModel:
     ) -> tuple[np.ndarray, None]:
         """Return the action that the loop sends in this step: (1, act_dim). An ``episode_start`` resets the loop.
 
-        :param observation: (1, ...), not normalised: the loop does that
+        :param observation: (1, ...), not normalised, since the loop normalises
         :raises ValueError: for more than one observation
         """
         parts = observation if isinstance(observation, dict) else {"observation": observation}

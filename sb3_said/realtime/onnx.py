@@ -14,7 +14,7 @@ from sb3_said.delays.space import STATE_KEYS, delayed_space, within_bounds
 
 
 class OnnxModel:
-    """Answers with a file of ``sb3-said export``, for a :class:`~sb3_said.realtime.ControlLoop`; on one thread.
+    """Answers by the graph in a file of ``sb3-said export``, on one thread; for a ``ControlLoop``.
 
     :param path: of the file
     :raises FileNotFoundError: where there is no such file
@@ -37,9 +37,9 @@ class OnnxModel:
             dtype = np.dtype(properties["action_dtype"])
             low, high = (np.array(json.loads(properties[name]), dtype) for name in ("action_low", "action_high"))
             self.action_space = spaces.Box(low, high, dtype=dtype.type)
-        except Exception as error:  # onnxruntime has many kinds
+        except Exception as error:  # onnxruntime raises many kinds
             raise ValueError(f"{path} is no file of sb3-said export, or damaged ({error}): export it again.") from error
-        #: Whether it reads what VecNormalize has normalised.
+        #: Whether the student reads observations that VecNormalize has normalised.
         self.reads_normalized = properties["reads_normalized"] == "true"
         state_space = spaces.Box(-np.inf, np.inf, (self._session.get_inputs()[0].shape[1],), np.float32)
         self.observation_space: spaces.Space[Any] = state_space
@@ -54,7 +54,7 @@ class OnnxModel:
         :raises ValueError: as :func:`~sb3_said.delays.observations.checked_observation`, and for an answer that is
             not finite
         """
-        if isinstance(observation, dict):  # it learned without them, whatever its planner reads
+        if isinstance(observation, dict):  # a student learned without these, even if its planner reads them
             observation = {key: part for key, part in observation.items() if key not in STATE_KEYS}
         given, is_batch = checked_observation(observation, self.observation_space)
         action: np.ndarray = self._session.run(["action"], given)[0]

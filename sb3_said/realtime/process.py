@@ -19,8 +19,8 @@ from sb3_said.realtime.asking import plan_of
 class ModelProcess:
     """Loads a model in another process and answers as it does, for a :class:`~sb3_said.realtime.ControlLoop`.
 
-    The process imports the script that makes it once more, so what the script does stands below
-    ``if __name__ == "__main__":``. Threads that ask at once are answered one after the other. A call that is
+    The process imports the calling script once more, so the script must do its work below
+    ``if __name__ == "__main__":``. Threads that ask at the same time are answered one by one. A call that is
     interrupted, as by Ctrl-C, ends the process.
 
     :param load: makes the model; a function that another process can import, such as
@@ -37,7 +37,7 @@ class ModelProcess:
         try:
             ForkingPickler.dumps(load)
             reason = None if callable(load) else "it is no function"
-        except Exception as error:  # pickle has many kinds
+        except Exception as error:  # pickle raises many kinds
             reason = str(error)
         if reason is not None:
             raise ValueError(
@@ -49,7 +49,7 @@ class ModelProcess:
         self._process = context.Process(target=_serve, args=(load, theirs), name="ModelProcess", daemon=True)
         self._process.start()
         theirs.close()
-        self._lock = threading.Lock()  # an answer belongs to the question before it
+        self._lock = threading.Lock()  # no other question may come between a question and its answer
         self.observation_space, self.action_space, self.reads_normalized = self._receive(
             ' It ended as it began: does the script make its ModelProcess below `if __name__ == "__main__":`?'
         )
@@ -61,7 +61,7 @@ class ModelProcess:
         self.close()
 
     def warmup(self) -> None:
-        """Warm the model up, where it can be."""
+        """Warm the model up, if it has a ``warmup``."""
         self._call("warmup")
 
     def predict(
@@ -76,7 +76,7 @@ class ModelProcess:
         return plan
 
     def close(self) -> None:
-        """End the process. Close the loop first, which may be waiting for an answer."""
+        """End the process. Close the loop first, since it may be waiting for an answer."""
         self._pipe.close()
         self._process.join(5)
         if self._process.is_alive():
@@ -95,7 +95,7 @@ class ModelProcess:
         try:
             answer, failure = self._pipe.recv()
         except BaseException as error:
-            self._pipe.close()  # interrupted: the next question would get what is left of this answer
+            self._pipe.close()  # else the next question would get what is left of this answer
             if not isinstance(error, (EOFError, ConnectionError)):
                 raise
             self._process.join(5)
@@ -108,13 +108,13 @@ class ModelProcess:
 
 
 def _serve(load: Callable[[], Any], pipe: Connection) -> None:
-    """Answer until the other end is closed. Ctrl-C is for the loop, which may still want an answer."""
+    """Answer until the other end is closed. Ctrl-C is ignored here, since the loop may still want an answer."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         model = load()
         told = model.observation_space, model.action_space, getattr(model, "reads_normalized", False)
         pipe.send((told, None))
-    except Exception as error:  # told to who asked
+    except Exception as error:  # the other end raises it
         pipe.send((None, f"{type(error).__name__}: {error}"))
         return
     with suppress(EOFError, OSError):

@@ -1,4 +1,4 @@
-"""What a control loop counts: how old observations were, how late answers, and how often it went without."""
+"""What a control loop counts: how old observations were, how long answers took, and how often one was missing."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ class LoopStatistics:
     """Counts of a :class:`~sb3_said.realtime.ControlLoop`, over all episodes since it was made. Memory is bounded."""
 
     ages: Counter[int] = field(default_factory=Counter)
-    """of the newest observation when an action was sent, in control steps; 1,000 stands for all above, as below"""
+    """of the newest observation when an action was sent, in control steps; 1,000 stands for all above, also below"""
     answer_steps: Counter[int] = field(default_factory=Counter)
-    """actions that were sent while an answer was made; of answers after an episode's first action"""
+    """actions sent while an answer was made, of each answer after an episode's first action"""
     gaps: Counter[float] = field(default_factory=Counter)
-    """from one action to the next, in periods, to a thousandth below 2 and to whole ones above; 0 where a clock went
-    back"""
+    """from one action to the next, in periods, rounded to a thousandth below 2 and to whole periods above; 0 where a
+    clock went back"""
     steps: int = 0
     """actions sent"""
     overruns: int = 0
@@ -32,13 +32,13 @@ class LoopStatistics:
     waiting_steps: int = 0
     """safe actions sent before an episode's first answer"""
     held_steps: int = 0
-    """actions repeated, since none was planned for the step"""
+    """actions repeated, since no action was planned for the step"""
     safe_steps: int = 0
     """safe actions sent, since holding had lasted too long"""
     late_answers: int = 0
-    """answers after the step that they were planned for; a plan's later actions serve"""
+    """answers after the step that they were planned for; the plan's later actions are used"""
     stale_observations: int = 0
-    """observations that were no younger than the one at hand (repeated by a frozen sensor, or overtaken), of another
+    """observations dropped: no younger than the one at hand (repeated by a frozen sensor, or overtaken), of another
     episode, or stamped ahead of now"""
 
     def count_age(self, age: int) -> None:

@@ -11,8 +11,8 @@ def ticks(
 ) -> Iterator[float]:
     """Yield the time now, once a period, without drift.
 
-    What the body of the loop takes is part of the period. Where it takes longer, the next tick comes at once, and the
-    beat goes on from there: missed ticks are not made up for.
+    The time that the loop's body takes is part of the period. If the body takes longer, the next tick comes at once and
+    the beat goes on from there: missed ticks are not made up for.
 
     :param period: in seconds
     :param clock: steady, in seconds

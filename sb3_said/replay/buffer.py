@@ -17,27 +17,27 @@ from sb3_said.replay.checks import OWN_ENVIRONMENT, check_finite, check_order, t
 from sb3_said.replay.stored import ROW_ARRAYS, check_stored
 from sb3_said.replay.windows import Windows, WindowSource
 
-UNCHANGED = 1e-3  # of [-1, 1]: what a wrapper's arithmetic in float32 may be off by
+UNCHANGED = 1e-3  # by how much a wrapper's float32 arithmetic may change an action in [-1, 1]
 NORMALIZED_ROWS = 10_000  # at a time
 
 
 def rows_for_logs(n_steps: int, max_delay: int) -> int:
-    """Return how many rows logs need: a full buffer has lost its oldest past, and does not sample it."""
+    """Return how many rows logs need: more than they fill, since a full buffer does not sample its oldest rows."""
     return max(n_steps + 1, max_delay + 2)
 
 
 class DelayedReplayBuffer(ReplayBuffer):
-    """Replay of a delayed task, at the memory of an undelayed one.
+    """Replay of a delayed task, in the memory of an undelayed one.
 
     Each row holds s_t, a_t, r_t, done, timeout, the age of the observation at t and the step t within its episode.
-    s_{t+1} is the next row's state, except where no row continues the episode; there it is kept aside (a *tail*).
-    Sampling returns what a store of whole transitions would, bit for bit. For a delayed observation space the sampled
-    observations have the extra key ``undelayed_observation``, the true state, for a delay-reconciled critic, and no
-    ``state_history``, which neither actor nor critics read.
+    s_{t+1} is the next row's state. If no row continues the episode, s_{t+1} is kept aside (a *tail*). Sampling returns
+    what a store of whole transitions would, bit for bit. In a delayed observation space, sampled observations have the
+    extra key ``undelayed_observation``, the true state, for a delay-reconciled critic. They have no ``state_history``,
+    which neither actor nor critics read.
 
-    The stored action is the one that was executed, as ``action_history`` says, or ``info["executed_action"]`` where
-    each action takes a time of its own to the actuator. The critics' transitions are the task's own there, too; rebuilt
-    histories hold what was executed instead of what was sent, which differs while delays change.
+    The stored action is the one that was executed: the newest of ``action_history``, or ``info["executed_action"]``
+    where each action takes a time of its own to the actuator. So the critics' transitions are the task's own there,
+    too. Rebuilt histories then hold the actions executed, not those sent; the two differ while delays change.
 
     :param buffer_size: transitions over all environments
     :param observation_space: that of ``DelayedObservationWrapper``, or a 1-D Box (delay 0)
@@ -46,9 +46,9 @@ class DelayedReplayBuffer(ReplayBuffer):
     :param n_envs: parallel environments
     :param optimize_memory_usage: must be False; each state is stored once anyway
     :param handle_timeout_termination: bootstrap at time limits
-    :param relabelled_ages: part of the sampled transitions that are shown as they would have been observed at another
-        one's age, in [0, 1]. The true states are all known, so that an episode under one delay teaches the others too;
-        where there is but one delay, nothing changes
+    :param relabelled_ages: part of the sampled transitions, in [0, 1], that are shown as they would have been observed
+        at another one's age. All true states are known, so an episode under one delay teaches the others too. Under
+        one fixed delay nothing changes
     :raises ValueError: for other spaces, a part outside [0, 1], or when the buffer cannot hold more steps than the
         largest delay
     """
@@ -98,7 +98,7 @@ class DelayedReplayBuffer(ReplayBuffer):
         self._next_ages = np.zeros(n_envs, np.int16)
         self._expected: dict[str, np.ndarray] | None = None
         self._has_warned_of_actions = False
-        self.holds_logs = False  # that an agent was given, and did not collect
+        self.holds_logs = False  # steps that the agent was given and did not collect
 
     # ------------------------------------------------------------------------------------------------ writing
 
@@ -114,12 +114,12 @@ class DelayedReplayBuffer(ReplayBuffer):
         """Store one transition of every environment.
 
         :param obs: observation before the action, (n_envs, obs_dim) or the wrapper's dict
-        :param next_obs: observation after it; at an episode's end its last one, not the one after reset
+        :param next_obs: observation after the action; at an episode's end the last one, not the one after reset
         :param action: (n_envs, act_dim) in [-1, 1]
         :param infos: each with ``undelayed_observation`` when the space is delayed
-        :raises ValueError: and nothing is stored, for what is not finite, a missing true state, a past of ``obs`` that
-            is neither stored nor empty, a ``next_obs`` that is not one action later, or an observation that is not the
-            state of its age
+        :raises ValueError: for what is not finite, a missing true state, a past of ``obs`` that is neither stored nor
+            empty, a ``next_obs`` that is not one action later, or an observation that is not the state of its age;
+            nothing is stored then
         """
         obs, next_obs = (x if isinstance(x, dict) else {"observation": x} for x in (obs, next_obs))
         row, previous = self.pos, (self.pos - 1) % self.buffer_size
@@ -128,16 +128,17 @@ class DelayedReplayBuffer(ReplayBuffer):
         if self.is_delayed:
             next_states = true_states(infos, self._next_states.shape[1:])
         parts = {"reward": reward, "action": action, "observation after the action": next_states}
-        if not continues.all():  # else it has been checked, as the last one after an action
+        if not continues.all():  # else it was checked as the observation after the last action
             parts["observation before the action"] = obs["observation"]
         check_finite(parts, self.n_envs)
         states = np.where(continues[:, None], self._next_states, obs["observation"])
         if self.is_delayed:
             check_order(obs, next_obs, continues, self._starts(obs))
-            # VecNormalize clips an episode's last one. Where each action takes a time of its own, ages count actions.
+            # Two kinds are not checked: VecNormalize clips an episode's last observation; where each action takes a
+            # time of its own, ``delay`` counts actions.
             is_state = (np.asarray(done) == 0) & np.array([EXECUTED not in info for info in infos])
             self._check_shown(next_obs, states, next_states, is_state)
-        timeouts = [bool(info.get("TimeLimit.truncated", False)) for info in infos]  # of a flag or an array of one
+        timeouts = [bool(info.get("TimeLimit.truncated", False)) for info in infos]  # the flag may be an array of one
         started = np.flatnonzero(~continues)
         for env in np.flatnonzero(self.ends[row]).tolist():  # overwritten
             del self.tails[row, env]
@@ -153,7 +154,7 @@ class DelayedReplayBuffer(ReplayBuffer):
         sent = next_obs["action_history"][:, -1] if self.max_delay > 0 else action
         self.actions[row] = sent.reshape(self.n_envs, self.action_dim)
         self._check_sent(self.actions[row], action)
-        if self.is_delayed:  # else the name is the task's own
+        if self.is_delayed:  # else the task itself may use that name
             for i, info in enumerate(infos):
                 if EXECUTED in info:
                     self.actions[row, i] = info[EXECUTED]
@@ -177,11 +178,11 @@ class DelayedReplayBuffer(ReplayBuffer):
             return np.zeros(self.n_envs, bool)
         same = [
             np.all((obs[key] == self._expected[key]).reshape(self.n_envs, -1), axis=1) for key in self._expected
-        ]  # fails where training was interrupted and the environment reset
+        ]  # False where training was interrupted and the environment was reset
         return np.logical_and.reduce(same) & (self.dones[self.pos - 1] == 0)
 
     def knows_past(self, obs: np.ndarray | dict[str, np.ndarray]) -> np.ndarray:
-        """Tell for each environment whether a step from ``obs`` can be added: the newest step led there, or none did.
+        """Tell for each environment whether ``obs`` follows the newest row or may begin an episode.
 
         :param obs: as in :meth:`add`
         :return: (n_envs,) bool
@@ -196,7 +197,7 @@ class DelayedReplayBuffer(ReplayBuffer):
         return np.logical_and.reduce([np.all(part == 0, axis=1) for part in past])
 
     def _check_sent(self, sent: np.ndarray, action: np.ndarray) -> None:
-        """Warn, once, where histories have other actions than were sent; both (n_envs, act_dim)."""
+        """Warn, once, if a history's newest action is not the one that the agent sent; both (n_envs, act_dim)."""
         off = float(np.abs(sent - np.reshape(action, sent.shape)).max())
         if off > UNCHANGED and not self._has_warned_of_actions:
             self._has_warned_of_actions = True
@@ -209,9 +210,9 @@ class DelayedReplayBuffer(ReplayBuffer):
     def _check_shown(
         self, next_obs: dict[str, np.ndarray], states: np.ndarray, next_states: np.ndarray, is_state: np.ndarray
     ) -> None:
-        """Refuse observations that are not the states of their ages, which sampling would show in their place.
+        """Refuse an observation that is not the state of its age: sampling would show that state instead.
 
-        :param states: (n_envs, obs_dim), true ones before the action, whose row is still to be written
+        :param states: (n_envs, obs_dim), true ones before the action; their row is not written yet
         :param next_states: (n_envs, obs_dim), true ones after it
         :param is_state: (n_envs,) bool, where the observation must be the state of its age
         :raises ValueError: naming the environment
@@ -292,7 +293,7 @@ class DelayedReplayBuffer(ReplayBuffer):
         )
 
     def to_torch(self, array: np.ndarray, copy: bool = False) -> th.Tensor:
-        """Hand what was gathered on as a tensor; gathering has copied it, so SB3's second copy is spared."""
+        """Turn a gathered array into a tensor, without SB3's second copy: gathering has copied it already."""
         return super().to_torch(array, copy)
 
     def _successors(self, rows: np.ndarray, envs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -306,10 +307,10 @@ class DelayedReplayBuffer(ReplayBuffer):
         return states, ages
 
     def _relabel(self, ages: np.ndarray, next_ages: np.ndarray, steps: np.ndarray) -> None:
-        """Give a part of the transitions the ages of others, in place, but none that reach before their episode.
+        """Give a part of the transitions the ages of others, in place, cut where these reach before their episode.
 
-        A pair (age, next age) stays together: so ages change from step to step as they do in play. Ages that only the
-        start of an episode keeps small are not handed on, which leaves a fixed delay as it is.
+        A pair (age, next age) is given as one, so that ages change from step to step as they do in play. A transition
+        that still shows s_0 gives none: only the episode's start keeps its age small. So a fixed delay stays as it is.
 
         :param ages: (B,)
         :param next_ages: (B,)
@@ -345,9 +346,9 @@ class DelayedReplayBuffer(ReplayBuffer):
         The buffer must not grow while the source is in use.
 
         :param newest_fraction: use only the newest part of the buffer (the paper's 20 % is 0.2), in (0, 1]
-        :param env: normalises states, as the expert's observations are
-        :param older: use the steps before that part instead, and end the episode that runs on into it there
-        :raises ValueError: when the buffer is empty, or that part is, or the fraction is not in (0, 1]
+        :param env: normalises states as it does the expert's observations
+        :param older: use the steps before that part instead; an episode that runs on into it is cut there
+        :raises ValueError: when the buffer or the part is empty, or the fraction is not in (0, 1]
         """
         if not 0.0 < newest_fraction <= 1.0:
             raise ValueError(f"newest_fraction is a part of the buffer in (0, 1], got {newest_fraction}.")
@@ -378,9 +379,9 @@ class DelayedReplayBuffer(ReplayBuffer):
         )
 
     def _normalized_rows(self, rows: np.ndarray, env: VecNormalize) -> np.ndarray:
-        """Return states as :meth:`normalized`, where the buffer has them; memory is taken for these rows alone."""
-        states = np.zeros(self.observations.shape, np.float32)  # the system gives what is never touched no memory
-        for part in np.array_split(rows, -(-len(rows) // NORMALIZED_ROWS)):  # through float64
+        """Return an array of the shape of ``observations`` with these rows normalised; only they take memory."""
+        states = np.zeros(self.observations.shape, np.float32)  # memory that is never touched is not taken
+        for part in np.array_split(rows, -(-len(rows) // NORMALIZED_ROWS)):  # in parts, since it goes through float64
             states[part] = self.normalized(self.observations[part], env)
         return states
 
@@ -405,7 +406,7 @@ class DelayedReplayBuffer(ReplayBuffer):
     def state_dict(self) -> dict[str, Any]:
         """Return everything stored, as arrays and numbers; unused rows are left out.
 
-        The arrays are this buffer's own memory: write them out, or copy them, before adding on.
+        The arrays are this buffer's own memory: write them out, or copy them, before you add more.
         """
         return {
             "holds_logs": self.holds_logs,
@@ -438,4 +439,4 @@ class DelayedReplayBuffer(ReplayBuffer):
         )
         for name in ROW_ARRAYS:
             getattr(self, name)[:size] = state[name]
-        self.ends[size:] = False  # of whatever was stored before
+        self.ends[size:] = False  # of what was stored before

@@ -1,4 +1,4 @@
-"""What a replay refuses to store: what networks would learn from in silence, and never recover from."""
+"""What a replay refuses to store: entries that networks would learn from in silence and never recover from."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def true_states(infos: list[dict[str, Any]], shape: tuple[int, ...]) -> np.ndarr
 def check_order(
     obs: dict[str, np.ndarray], next_obs: dict[str, np.ndarray], continues: np.ndarray, starts: np.ndarray
 ) -> None:
-    """Refuse a transition that, as histories and ages tell, is out of order.
+    """Refuse a transition whose history or age shows that it is out of order.
 
     :param continues: (n_envs,) bool, whether ``obs`` goes on from the newest row
     :param starts: (n_envs,) bool, whether ``obs`` can be the first of an episode

@@ -12,7 +12,7 @@ ROW_ARRAYS = ("observations", "actions", "rewards", "dones", "timeouts", "ages",
 
 
 def check_stored(buffer: Any, state: dict[str, Any]) -> None:
-    """Hold what a buffer's ``state_dict`` returned against another buffer, which is to take it over.
+    """Check what a buffer's ``state_dict`` returned against the buffer that is to take it over.
 
     :param buffer: a ``DelayedReplayBuffer``
     :raises ValueError: when it came from a buffer of another shape, or holds what no buffer stores

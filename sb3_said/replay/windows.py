@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import torch as th
 
-COMMON = 0.25  # part of an even share of all decisions that an age needs, to be imitated by itself
+COMMON = 0.25  # an age is imitated by itself if it has at least this part of an even share of all decisions
 
 
 class Windows(NamedTuple):
@@ -22,7 +22,7 @@ class Windows(NamedTuple):
     states: th.Tensor  # (B, L, obs_dim) float32
     actions: th.Tensor  # (B, L, act_dim) float32, in [-1, 1]
     valid: th.Tensor  # (B, L) bool; a prefix of each row, never empty
-    values: th.Tensor  # (B,) float32, what the source says of the first state
+    values: th.Tensor  # (B,) float32, the source's value of the first state
 
     def to(self, device: th.device | str) -> Windows:
         """Return these windows on a device."""
@@ -30,28 +30,28 @@ class Windows(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What each decision was made on: the start that lies its age before it."""
+    """What each decision was made on: the start that lies as many steps earlier as the observation was old."""
 
-    starts: th.Tensor  # (n_starts,) int64, -1 where that is not stored
-    by_age: th.Tensor  # (n_stored + 1,) those that are, sorted by age, and a last one that stands for none
+    starts: th.Tensor  # (n_starts,) int64, for each decision; -1 where that start is not stored
+    by_age: th.Tensor  # (n_stored + 1,) the stored ones, sorted by age, and a placeholder at the end
     firsts: th.Tensor  # (n_ages,) where each age begins in by_age
-    sizes: th.Tensor  # (n_ages,) how many it has
+    sizes: th.Tensor  # (n_ages,) how many starts each age has
     is_common: th.Tensor  # (n_ages,) bool, whether windows are drawn by this age
 
 
 def mean_and_deviation(rows: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     """Return both of rows (M, n): (n,) each, a deviation of 1 for entries that vary by no more than rounding.
 
-    To divide by the tiny deviation that rounding may leave a constant entry would blow that noise up.
+    Rounding may leave a constant entry a tiny deviation. To divide by it would blow up noise.
     """
-    variance, mean = th.var_mean(rows, dim=0, correction=0)  # a mean alone is off where an entry never moves
+    variance, mean = th.var_mean(rows, dim=0, correction=0)  # rows.mean would round where an entry never moves
     deviation = variance.sqrt()
     return mean, th.where(deviation <= 1e-6 * rows.abs().amax(0), 1.0, deviation)
 
 
 @dataclass(frozen=True)
 class WindowSource:
-    """Every place a window can start, over arrays that are shared and, but by :meth:`to`, never copied.
+    """Every place a window can start. The arrays of steps are shared; only :meth:`to` copies them.
 
     The arrays are laid out as a replay buffer's: ``n_rows`` time steps of ``n_envs`` parallel environments, possibly
     wrapped around. A plain dataset is the case ``n_envs=1``.
@@ -65,8 +65,8 @@ class WindowSource:
     :param remaining: (n_starts,) int64, stored steps from the start to its episode's end, both included, >= 1
     :param episodes: (n_starts,) int64, a number for the episode each start belongs to
     :param values: (n_starts,) float32, a value of each start's state, by which a trainer may weigh windows
-    :param ages: (n_starts,) int64, of the observation that each start's action was decided on, in control steps; None
-        where that is not known, as in logs
+    :param ages: (n_starts,) int64, age of the observation that each start's action was decided on, in control steps;
+        None where that is not known, as in logs
     :raises ValueError: for states, actions, rewards or values of another dtype
     """
 
@@ -105,9 +105,9 @@ class WindowSource:
         :param batch_size: B
         :param length: L, steps of a window
         :param generator: torch's global one of the CPU by default
-        :param early_probability: of a start whose episode is uniform over all episodes, and the logarithm of whose step
-            is uniform: as many in steps 1 to 10 of an episode as in 10 to 100. An episode whose first steps are not
-            here begins with the first that is
+        :param early_probability: probability of an early start. Its episode is drawn uniformly, and so is the logarithm
+            of its step: as many are in steps 1 to 10 as in 10 to 100. If an episode's first steps are not here, the
+            first that is counts as step 1
         """
         return self.gather(self._draw(batch_size, generator, early_probability)[0], length)
 
@@ -116,13 +116,14 @@ class WindowSource:
     ) -> tuple[Windows, th.Tensor]:
         """Draw windows whose decision, d steps after their start, was made on the observation at their start.
 
-        An agent of varying delays may do one thing on new observations and another on old ones. Where a window shows
-        what its decision was made on, there is one answer to learn; else their mean.
+        An agent under varying delays may do one thing on new observations and another on old ones. If a window begins
+        at what its decision was made on, there is one answer to learn; else there is only the mean of several.
 
-        :param delay: (B,) int64 d, ages to draw decisions of. Of an age that hardly any was made at any window is drawn
+        :param delay: (B,) int64, the age d of each decision to draw. If hardly any was made at that age, any window is
+            drawn
         :param length: L, steps of a window
         :param generator: torch's global one of the CPU by default
-        :param early_probability: as of :meth:`sample`, of decisions, whose age is then their own
+        :param early_probability: as in :meth:`sample`, but of decisions; these have their own age instead of ``delay``
         :return: windows, and the ages of their decisions, (B,)
         """
         seen = self._seen
@@ -137,7 +138,7 @@ class WindowSource:
         return self.gather(starts, length), delay
 
     def own_starts(self, age: int) -> th.Tensor:
-        """Return the starts that decisions of an age were made on, and none where :meth:`sample_own` draws others."""
+        """Return the starts that decisions of an age were made on; none where :meth:`sample_own` draws any window."""
         seen = self._seen
         if age >= len(seen.sizes) or not seen.is_common[age]:
             return seen.by_age[:0]
@@ -161,7 +162,7 @@ class WindowSource:
 
     @cached_property
     def _by_episode(self) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-        """All starts by episode and step, (n_starts,), and each episode's first place there and number of starts."""
+        """All starts by episode and step, (n_starts,); each episode's first place in them, and its number of starts."""
         by_step = self.remaining.argsort(descending=True, stable=True)
         order = by_step[self.episodes[by_step].argsort(stable=True)]
         sizes = th.unique(self.episodes, return_counts=True)[1]
@@ -178,7 +179,7 @@ class WindowSource:
         starts = th.full_like(order, -1)
         starts[order] = th.where(is_here, order[before.clamp(min=0)], -1)
         by_age = starts[order[is_here]][ages[is_here].argsort(stable=True)]
-        by_age = th.cat([by_age, by_age.new_zeros(1)])  # a place for what is looked up of an age without any
+        by_age = th.cat([by_age, by_age.new_zeros(1)])  # so that an age without starts can be looked up, too
         sizes = th.bincount(ages[is_here], minlength=1)
         is_common = sizes * len(sizes) >= COMMON * len(self)
         return Seen(starts, by_age, sizes.cumsum(0) - sizes, sizes, is_common)
@@ -197,14 +198,14 @@ class WindowSource:
         return Windows(self.states[rows, envs], self.actions[rows, envs], steps < remaining, self.values[starts])
 
     def to(self, device: th.device | str) -> WindowSource:
-        """Return this source over copies of the arrays on a device; where they are there already, over the same."""
+        """Return this source with its arrays copied to a device; those that are there already are shared."""
         return self._with((field.name for field in fields(self)), lambda array: array.to(device))
 
     def split(self, held_out: float, seed: int = 0) -> tuple[WindowSource, WindowSource]:
         """Split by episodes into a training and a held-out source, so that no step is in windows of both.
 
-        Episodes are drawn at random and held out as a whole. Of the last one drawn, no more than the end is, so that
-        few or long episodes do not cost the training more than it was asked for.
+        Episodes are drawn at random and held out as a whole. Of the last one drawn, only as many steps of its end are
+        held out as are still missing. So few or long episodes do not cost the training more than it was asked for.
 
         :param held_out: fraction of the starts to hold out, in (0, 1); at least one is
         :param seed: of the draw
@@ -239,7 +240,7 @@ class WindowSource:
         return self._with(("rows", "envs", "remaining", "values", "episodes", "ages"), itemgetter(keep))
 
     def _with(self, names: Iterable[str], change: Callable[[th.Tensor], th.Tensor]) -> WindowSource:
-        """Return this source with some arrays changed; ages that are not known stay so."""
+        """Return this source with some arrays changed; unknown ages stay None."""
         arrays = {name: getattr(self, name) for name in names}
         changed: dict[str, Any] = {name: x if x is None else change(x) for name, x in arrays.items()}
         return replace(self, **changed)

@@ -48,7 +48,7 @@ REPLAY = "replay buffer"  # kind of its file
 
 
 class DelayedSAC(SafeSaveMixin, SAC):
-    """SAC whose actor knows the actions sent since and whose critics know the true state (SADR).
+    """SAC whose actor knows the actions sent since its observation, and whose critics know the true state (SADR).
 
     Two flags span the baselines of "Addressing Signal Delay in Deep RL" (Wang et al., ICLR 2024):
 
@@ -67,12 +67,12 @@ class DelayedSAC(SafeSaveMixin, SAC):
     :param policy: ``"MultiInputPolicy"`` or ``"MlpPolicy"``, which name the same class
     :param env: a task in a ``DelayedObservationWrapper``, or one with a 1-D Box observation (delay 0)
     :param learning_rate: of actor, critics and entropy coefficient; a number or a schedule
-    :param learning_starts: environment steps of random actions before the first update; rl_zoo3's and Wang et al.'s for
-        MuJoCo, where SB3 has 100
+    :param learning_starts: environment steps of random actions before the first update; the default is that of rl_zoo3
+        and Wang et al. for MuJoCo, SB3's is 100
     :param augment_state: the actor reads [observation, action history, age]
     :param delay_reconciled_critic: the critics read the true state
-    :param relabelled_ages: part of an update's transitions, in [0, 1], that are shown at the age of another one: where
-        delays vary, each step teaches the actor what to do under the others too. Measured at delays 0..16
+    :param relabelled_ages: part of an update's transitions, in [0, 1], that are shown at the age of another one. So
+        where delays vary, each step teaches the actor what to do under other delays, too. Measured at delays 0..16
         (results/any_delay_halfcheetah.md); 0 is SADR as published. Under one fixed delay nothing changes
     :param sac_kwargs: every other argument of :class:`stable_baselines3.SAC`
     :raises ValueError: for other spaces, a ``VecNormalize`` of more than the observation, numbers out of range, or
@@ -90,7 +90,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
     action_space: spaces.Box
     policy: DelayedSACPolicy
     replay_buffer: DelayedReplayBuffer
-    _left_at: list[tuple[int, int]] | None = None  # what Monitors of a task without delay had counted
+    _left_at: list[tuple[int, int]] | None = None  # what Monitors of a task without delay had counted after learn()
 
     def __init__(
         self,
@@ -160,18 +160,18 @@ class DelayedSAC(SafeSaveMixin, SAC):
     def _note_task(self) -> None:
         """Remember what files name: the task's id, and whether its observations are normalised.
 
-        Environments without delay in other processes do not tell the id; whoever makes them may know it.
+        Environments without delay in other processes do not tell the id; whoever makes them may set ``task``.
         """
         self.reads_normalized = self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
         env = None if self.env is None else self.env.unwrapped
         if isinstance(env, DummyVecEnv) and env.envs[0].spec is not None:
             self.task = env.envs[0].spec.id
         elif env is not None and has_attribute(env, "task_id"):
-            found = env.get_attr("task_id", 0)[0]  # of a wrapper of ours; a task may mean something else by it
+            found = env.get_attr("task_id", 0)[0]  # our wrapper's; a task's own may mean something else
             self.task = found if isinstance(found, str) else self.task
 
     def _check_env(self, env: VecEnv) -> None:
-        """Refuse spaces that are not served, and what no space tells of an environment, with a ``ValueError``."""
+        """:raises ValueError: for spaces that are not served, and for faults of an environment that no space shows"""
         check_spaces(env.observation_space, env.action_space)
         if isinstance(env.observation_space, spaces.Box) and any(_are_wrapped(env, DelayedObservationWrapper)):
             raise ValueError(
@@ -209,14 +209,14 @@ class DelayedSAC(SafeSaveMixin, SAC):
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
         obs = self._last_obs if self._vec_normalize_env is None else self._last_original_obs
-        # The replay was emptied, or not loaded with the agent, or somebody has played the environments
+        # Begin anew if the replay was emptied or not loaded with the agent, or if somebody has played the environments
         if obs is not None and not (self.replay_buffer.knows_past(obs).all() and self._are_at(obs)):
             self._last_obs = None  # SB3 then resets the environments
         if (reset_num_timesteps or self._last_obs is None) and self.env is not None:
             for monitor in self._strict_monitors():
                 monitor.needs_reset = True
         self._note_task()
-        name = type(self).__name__ if tb_log_name == "SAC" else tb_log_name  # SB3's default would be all algorithms'
+        name = type(self).__name__ if tb_log_name == "SAC" else tb_log_name  # SB3's default would name all algorithms
         learn = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, name, progress_bar)
         self.trained_ages = ages_of(self.env)
         return learn
@@ -230,9 +230,9 @@ class DelayedSAC(SafeSaveMixin, SAC):
         return all(np.array_equal(obs[key][i], part) for i, parts in enumerate(last) for key, part in parts.items())
 
     def _steps_counted(self) -> list[tuple[int, int]] | None:
-        """Return what SB3's ``Monitor`` has counted of each environment, in all and in this episode.
+        """Return the steps that SB3's ``Monitor`` has counted in each environment, in all and in this episode.
 
-        None without Monitors, and where no episode has a step yet: they do not tell one reset from another.
+        None without Monitors, and if no episode has a step yet: a Monitor does not tell one reset from another.
         """
         assert self.env is not None
         if not all(_are_wrapped(self.env, Monitor)):
@@ -241,9 +241,9 @@ class DelayedSAC(SafeSaveMixin, SAC):
         return [*zip(self.env.get_attr("total_steps"), in_episode, strict=True)] if any(in_episode) else None
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
-        """Collect as SB3 does, which does not store the step at which a callback ends training, or an exception.
+        """Collect as SB3 does, and start new episodes in the next ``learn`` if this was broken off.
 
-        The next ``learn`` starts new episodes then, instead of going on from an observation that is gone.
+        SB3 does not store the step at which a callback or an exception ends training, so the last observation is gone.
         """
         rollout = None
         try:
@@ -263,22 +263,22 @@ class DelayedSAC(SafeSaveMixin, SAC):
             if self._vec_normalize_env is not None:
                 self._last_original_obs = self._vec_normalize_env.get_original_obs()
         action, scaled = super()._sample_action(*args, **kwargs)
-        is_whole = holds_whole_numbers(self.action_space)  # then what is stored is what the task was sent
+        is_whole = holds_whole_numbers(self.action_space)  # then the rounded action is stored, as it was sent
         return action, self.policy.scale_action(action) if is_whole else scaled
 
     def _store_transition(self, *args: Any, **kwargs: Any) -> None:
-        if self._last_obs is not None:  # else a callback has played at this very step, whose observation is gone
+        if self._last_obs is not None:  # else a callback has played at this step, and its observation is gone
             super()._store_transition(*args, **kwargs)
 
     def _monitors(self) -> list[Monitor | VecMonitor]:
-        """Return those of SB3's that are in this process."""
+        """Return SB3's monitors in this process."""
         assert self.env is not None
         envs = getattr(self.env.unwrapped, "envs", [])
         found = [unwrap_vec_wrapper(self.env, VecMonitor), *(unwrap_wrapper(env, Monitor) for env in envs)]
         return [monitor for monitor in found if isinstance(monitor, (Monitor, VecMonitor))]
 
     def _strict_monitors(self) -> list[Monitor]:
-        """Return those that refuse a reset amid an episode, unless they are told that it is due."""
+        """Return the monitors that refuse a reset amid an episode unless ``needs_reset`` is set."""
         return [x for x in self._monitors() if isinstance(x, Monitor) and not x.allow_early_resets]
 
     @contextmanager
@@ -286,7 +286,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
         """Hand out the training environment for steps that teach nothing.
 
         ``VecNormalize`` keeps its statistics and does not scale rewards. Files of SB3's ``Monitor`` get no rows of
-        these steps, except those of environments in other processes. Learning, where it goes on, starts a new episode.
+        these steps, except those of environments in other processes. If learning goes on, it starts a new episode.
         """
         assert self.env is not None
         monitors, strict = self._monitors(), self._strict_monitors()
@@ -345,9 +345,9 @@ class DelayedSAC(SafeSaveMixin, SAC):
             warnings.warn(f"This {type(self).__name__} learned from observations {told}", stacklevel=3)
 
     def check_ages(self, ages: list[int]) -> None:
-        """Warn where an agent is to act on observations of ages that it has not met in training, amid episodes.
+        """Warn if an agent is to act, amid episodes, on observations of ages that it has not met in training.
 
-        They are not an error, since training can go on with them, but nothing was learned there.
+        This is no error, since training can go on at these ages, but nothing was learned there yet.
 
         :param ages: that it will meet, in control steps (see :func:`ages_of`)
         """
@@ -361,7 +361,7 @@ class DelayedSAC(SafeSaveMixin, SAC):
             )
 
     def _acts_at(self, ages: list[int]) -> list[int]:
-        """Return the ages that the actor meets, of those that the agent does."""
+        """Return the ages that the actor meets if the agent meets these."""
         return ages
 
     def predict(
@@ -371,12 +371,12 @@ class DelayedSAC(SafeSaveMixin, SAC):
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Answer as SB3 does, and warn like :meth:`check_ages` where observations amid an episode have other ages."""
+        """Answer as SB3 does, and warn like :meth:`check_ages` where observations amid an episode have unmet ages."""
         answer = super().predict(observation, state, episode_start, deterministic)
         if isinstance(observation, dict) and self.trained_ages is not None:
             ages = np.ravel(as_array(observation["delay"]))  # (B,)
             if not set(ages.tolist()) <= set(self.trained_ages):
-                # As many actions as the history holds have been sent: no younger age is due to the episode's start.
+                # A full history only: before, the age may be small just because the episode has begun.
                 history = as_array(observation["action_history"]).reshape(len(ages), self.policy.max_delay, -1)
                 self.check_ages(sorted({int(age) for age in ages[history[:, 0].any(1)]}))
         return answer
@@ -421,20 +421,20 @@ class DelayedSAC(SafeSaveMixin, SAC):
         state = load_tree(found, REPLAY)
         replay = self.replay_buffer
         with readable(found, explained=(ValueError,)):
-            if state["holds_logs"] is True:  # however long they are
+            if state["holds_logs"] is True:  # in a buffer of their own length
                 if not self.learns_from_logs:
                     raise ValueError(
                         f"It holds logs, from which {type(self).__name__} does not learn; SAID, BC and DQL do"
                     )
                 replay = self._new_replay_buffer(rows_for_logs(len(state["rewards"]), self.policy.max_delay), n_envs=1)
-            elif replay is None or replay.holds_logs:  # which are no longer than they have to be
+            elif replay is None or replay.holds_logs:  # a buffer of logs is only as long as its logs
                 replay = self._new_replay_buffer()
             replay.load_state_dict(state)
         self.replay_buffer, replay.device = replay, self.device
 
 
 def _are_wrapped(env: VecEnv, wrapper: type[gym.Wrapper[Any, Any, Any, Any]]) -> list[bool]:
-    """Tell which environments have a wrapper: none of a simulator that is no Gymnasium and cannot be asked."""
+    """Tell which environments have a wrapper; False for a simulator that is not Gymnasium's and cannot be asked."""
     try:
         return env.env_is_wrapped(wrapper)
     except (NotImplementedError, AttributeError):

@@ -1,4 +1,4 @@
-"""What the episodes of a training return: whether they still show what was learned."""
+"""The returns of a training's episodes: do they still show what was learned?"""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ import torch as th
 
 from sb3_said.sac.scaling import OnTheHost
 
-N_EPISODES = 10  # whose mean is looked at
-LOST = 0.5  # of what was learned: by hindsight on two runs, results/stable_expert.md
-NOISE = 1.2  # standard deviations of the ten that a fall is above; where six of ten fall it is
-FORGETS = 100_000  # environment steps in which the best fades to 1 / e, where no episode returns as much any more
+N_EPISODES = 10  # whose mean is taken
+LOST = 0.5  # part of what was learned, chosen in hindsight on two runs: results/stable_expert.md
+NOISE = 1.2  # standard deviations of the ten that a fall must exceed, as it does if six of ten fall
+FORGETS = 100_000  # environment steps in which the lead of the best over the mean fades to 1 / e
 
 
 class TrainingEpisodes(OnTheHost):
-    """Tells when a policy that had learned has lost half of it, by its training episodes and by nothing else.
+    """Tells when a policy has lost half of what it had learned, from its training episodes alone.
 
-    A return can collapse within ten episodes, after a hundred thousand steps of none that was bad
-    (results/stable_expert.md). TD7 (https://arxiv.org/abs/2306.02451, "Policy Checkpoints") keeps a policy by the worst
-    of its training episodes for that. Here the mean of the last ten is compared with that of the first ten and the best
-    so far, so rewards may have any sign and size.
+    Returns can collapse within ten episodes, after a hundred thousand steps without a bad one
+    (results/stable_expert.md). So TD7 (https://arxiv.org/abs/2306.02451, "Policy Checkpoints") keeps a policy by the
+    worst of its training episodes. Here the mean of the last ten is compared with that of the first ten and with the
+    best mean so far, so rewards may have any sign and size.
     """
 
     newest: th.Tensor  # (N_EPISODES,) returns, the latest last
@@ -51,14 +51,14 @@ class TrainingEpisodes(OnTheHost):
     def have_collapsed(self) -> bool:
         """Whether the last ten episodes have lost half of what was learned since the first ten, and more than noise.
 
-        What was learned since is no more than noise where an agent had learned before, and less than nothing where a
-        task returns less than it did.
+        If an agent had learned before, ``best - first`` is only noise. If a task returns less than it did, this is
+        negative.
         """
         fall, learned = self.best - self.newest.mean(), self.best - self.first
         noise = self.newest.std(correction=0)
         return bool(self.count > N_EPISODES) and bool(fall > th.maximum(LOST * learned.abs(), NOISE * noise))
 
     def forget(self) -> None:
-        """Begin anew, as another training does."""
+        """Start over, for another training."""
         for value in self.buffers():
             value.zero_()

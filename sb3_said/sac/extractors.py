@@ -13,8 +13,8 @@ from sb3_said.sac.scaling import StateNormalizer
 class StateAugmentedExtractor(BaseFeaturesExtractor):
     """Concatenate [delayed observation, actions sent since, age / D], which make the process Markov (Theorem 2.1).
 
-    Actions older than the observation are shown as zeros: it holds all that they did, and one actor for many ages would
-    have to learn to look away. A ``state_history`` is not read.
+    Actions older than the observation are shown as zeros: the observation holds all that they did, and one actor for
+    many ages would have to learn to ignore them. A ``state_history`` is not read.
 
     :param observation_space: that of ``DelayedObservationWrapper``
     :param normalizer: of the observation, None for none

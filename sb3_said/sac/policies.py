@@ -33,7 +33,7 @@ NOT_FINITE = (
     "damaged, or its training diverged."
 )
 
-#: Arguments of the policy that ask for something of whoever trains it; only ``StableSAC`` does it all
+#: Arguments of the policy that the algorithm must serve in training; only ``StableSAC`` serves them all
 SERVED = ("normalise_states", "scale_rewards", "average_actor")
 OWN_ARGUMENTS = ("augment_state", "delay_reconciled_critic", "critic_layer_norm", *SERVED)
 
@@ -44,7 +44,8 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
     :param augment_state: the actor reads [observation, action history, age] instead of the observation alone
     :param delay_reconciled_critic: the critics read the true state, which only replay knows, instead of what the actor
         reads
-    :param normalise_states: both read z-scores of states (see :class:`~sb3_said.sac.scaling.StateNormalizer`)
+    :param normalise_states: actor and critics read z-scores of states
+        (see :class:`~sb3_said.sac.scaling.StateNormalizer`)
     :param scale_rewards: the critics' values are in units of a :class:`~sb3_said.sac.scaling.ReturnScale`
     :param average_actor: an average of the actor's weights answers, see :meth:`without_average`
     :param critic_layer_norm: a LayerNorm follows each hidden layer of the critics, before its activation
@@ -95,7 +96,7 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         if self.normalise_states:
             state_space = check_spaces(self.observation_space, self.action_space).state
             self.state_normalizer = StateNormalizer(state_space.shape[0])
-        if self.replay_space is not None:  # actor and critics are shown what is sampled
+        if self.replay_space is not None:  # actor and critics read what replay samples
             self.actor_kwargs["observation_space"] = self.critic_kwargs["observation_space"] = self.replay_space
         super()._build(lr_schedule)
         self.averaged_actor: Actor | None = None
@@ -117,9 +118,9 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
             self._answers_as_average = before
 
     def forget_graph(self) -> None:
-        """Drop the distribution of the actor's last batch, whose graph ``copy.deepcopy`` could not take.
+        """Drop the distribution of the actor's last batch, since ``copy.deepcopy`` cannot copy its graph.
 
-        That of gSDE holds its noise, too, and stays.
+        With gSDE the distribution also holds the noise, and stays.
         """
         if not self.actor.use_sde:
             fresh = SquashedDiagGaussianDistribution(get_action_dim(self.action_space))
@@ -145,7 +146,7 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         return critic
 
     def _extractor(self, key: str) -> BaseFeaturesExtractor | None:
-        """Return what reads a key of delayed observations, or all of others; None for SB3's own."""
+        """Return an extractor of one key of delayed observations, or of a plain one; None for SB3's own."""
         if self.replay_space is None:
             if self.state_normalizer is None:
                 return None
@@ -155,7 +156,7 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         return KeyExtractor(self.replay_space, key, self.state_normalizer)
 
     def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
-        """Turn what ``predict`` was given into float32 tensors of their own memory, after checking it.
+        """Check what ``predict`` was given, and copy it into float32 tensors.
 
         :param observation: one observation or a batch of them, of any numbers
         :return: tensors with a batch dimension, and whether they had one before
@@ -163,7 +164,7 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         """
         arrays, is_batch = self.obs_to_arrays(observation)
         # SB3's own method cannot reshape an action history of no actions, that of max_delay 0.
-        device = self.device  # which SB3 looks for among all parameters
+        device = self.device  # read once: SB3 looks for it among all parameters
         tensors = {key: th.as_tensor(x, device=device) for key, x in arrays.items()}
         return tensors if isinstance(self.observation_space, spaces.Dict) else tensors["observation"], is_batch
 
@@ -178,7 +179,7 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Answer as SB3 does, and only with actions of the action space: whoever answers, they all pass here.
+        """Answer as SB3 does, and only with actions of the action space: every answer passes here.
 
         :raises ValueError: as :meth:`obs_to_tensor`, and for an action that is not finite
         """
@@ -195,7 +196,7 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
             largest = max(float(np.abs(part).max(initial=0.0)) for part in parts)
             raise ValueError(f"{NOT_FINITE} The largest entry of the observation is {largest:.3g}.")
         space = self.action_space
-        return np.clip(actions, space.low, space.high)  # scaling to the bounds may round to beyond them
+        return np.clip(actions, space.low, space.high)  # scaling to the bounds may round beyond them
 
     def scale_action(self, action: np.ndarray) -> np.ndarray:
         space = self.action_space
@@ -203,7 +204,7 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
 
     def unscale_action(self, scaled_action: np.ndarray) -> np.ndarray:
         space = self.action_space
-        is_whole = holds_whole_numbers(space)  # which SB3 leaves as fractions, in a type that may not hold the range
+        is_whole = holds_whole_numbers(space)  # SB3 leaves fractions, in a type that may not hold the range
         return unscale_action(scaled_action, space) if is_whole else super().unscale_action(scaled_action)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
@@ -233,7 +234,7 @@ def rows_of(observation: PyTorchObs) -> Iterator[PyTorchObs]:
 
 
 def seed_of(row: PyTorchObs) -> int:
-    """Return a seed that the observation alone decides, for draws that repeat where it does."""
+    """Return a seed that depends on the observation alone, so that equal observations get equal draws."""
     entries = [row[key] for key in sorted(row)] if isinstance(row, dict) else [row]
     return zlib.crc32(b"".join((entry.cpu().numpy() + 0.0).tobytes() for entry in entries))  # -0.0 is 0.0
 
@@ -251,8 +252,8 @@ def settings_of(cls: Any, given: dict[str, Any] | None, whose: str) -> Any:
 
     :param cls: a dataclass
     :param given: some of its fields; None for none
-    :param whose: settings they are, for the error
-    :raises ValueError: for what is no dict, for a field that it does not have, and as the class does
+    :param whose: owner of the settings, for the error
+    :raises ValueError: for anything but a dict, for a field that the class lacks, and as the class does
     """
     names = [field.name for field in fields(cls)]
     if not isinstance(given, dict | None):

@@ -10,12 +10,12 @@ from torch import nn
 
 from sb3_said.replay.windows import mean_and_deviation
 
-LARGEST_SCALED_RETURN = 5.0  # of SimbaV2: the returns that its critic can tell apart end there
-LARGEST_SCORE = 10.0  # of SB3's VecNormalize
+LARGEST_SCALED_RETURN = 5.0  # of SimbaV2, whose critic tells no larger returns apart
+LARGEST_SCORE = 10.0  # as in SB3's VecNormalize
 
 
 class OnTheHost(nn.Module):
-    """Keeps its float64 buffers on the CPU: Apple's GPUs have no float64, and to read one would wait for any GPU."""
+    """Keeps its float64 buffers on the CPU: Apple's GPUs have no float64, and reading from any GPU waits for it."""
 
     def _apply(self, fn: Callable[[th.Tensor], th.Tensor], recurse: bool = True) -> OnTheHost:
         everything = self._buffers
@@ -26,22 +26,22 @@ class OnTheHost(nn.Module):
 
 
 def running_return(reward: np.ndarray, before: np.ndarray, begins: np.ndarray, gamma: float = 1.0) -> np.ndarray:
-    """Return G_t = gamma G_{t-1} + r_t, which starts at 0 where an episode begins: (n_envs,), as all of these."""
+    """Return G_t = gamma G_{t-1} + r_t, with G_{t-1} = 0 where an episode begins; all arrays are (n_envs,)."""
     return reward + gamma * np.where(begins, 0.0, before)
 
 
 class ReturnScale(OnTheHost):
-    """The size of discounted returns so far, which rewards are divided by (SimbaV2, https://arxiv.org/abs/2502.15280).
+    """The size of discounted returns so far, to divide rewards by (SimbaV2, https://arxiv.org/abs/2502.15280).
 
-    Of every step's running return G_t = gamma G_{t-1} + r_t, with G_{t-1} = 0 where an episode begins, it keeps mean
-    and variance, and the largest one: ``value`` = max(sd(G), max |G| / 5), and 1 before the first.
+    It keeps mean, variance and largest size of the running returns G_t = gamma G_{t-1} + r_t of all steps, with
+    G_{t-1} = 0 where an episode begins. ``value`` = max(sd(G), max |G| / 5), and 1 before the first step.
     """
 
     mean: th.Tensor
     variance: th.Tensor
     count: th.Tensor
     largest: th.Tensor
-    value: th.Tensor  # () float32, where the networks are, whose CUDA graphs read it
+    value: th.Tensor  # () float32, on the networks' device, since CUDA graphs read it
 
     def __init__(self) -> None:
         super().__init__()
@@ -63,13 +63,13 @@ class ReturnScale(OnTheHost):
 
 
 def _take_value(scale: ReturnScale, _: object = None) -> None:
-    """Set its ``value``; a function of the module, which can be pickled as a hook."""
+    """Set ``value``. As a hook it must be picklable, and so a function of the module."""
     size = float(th.maximum(scale.variance.sqrt(), scale.largest / LARGEST_SCALED_RETURN).float())
     scale.value.fill_(size if size > 0 else 1.0)
 
 
 class StateNormalizer(OnTheHost):
-    """z-scores of states, (s - mean) / sd, cut at +-10. Before its first fit it changes nothing but that.
+    """z-scores of states, (s - mean) / sd, cut at +-10. Before its first fit it only cuts.
 
     :param obs_dim: of a state
     """
@@ -85,7 +85,7 @@ class StateNormalizer(OnTheHost):
         self.register_buffer("fitted_at", th.zeros((), dtype=th.float64))  # environment steps
 
     def fit(self, states: th.Tensor, n_steps: int) -> None:
-        """Take mean and standard deviation of states, (N, obs_dim), which were replayed at this environment step."""
+        """Take mean and standard deviation of replayed states, (N, obs_dim), at environment step ``n_steps``."""
         mean, deviation = mean_and_deviation(states)
         self.mean.copy_(mean)
         self.deviation.copy_(deviation)

@@ -19,9 +19,9 @@ from sb3_said.sac.episodes import TrainingEpisodes
 from sb3_said.sac.policies import DelayedSACPolicy
 from sb3_said.sac.scaling import running_return
 
-REFIT_GROWTH = 1.1  # the states are looked at again when there are a tenth more of them
+REFIT_GROWTH = 1.1  # the z-scores are fitted again after a tenth more environment steps
 STATES_LOOKED_AT = 10_000
-YOUTH = 4.0  # decays of a young average are 1 - YOUTH / n, so that it is n / 5 updates old: results/stable_expert.md
+YOUTH = 4.0  # update n decays a young average by 1 - YOUTH / n, so it is n / 5 updates old: results/stable_expert.md
 
 
 class StableSAC(DelayedSAC):
@@ -32,29 +32,28 @@ class StableSAC(DelayedSAC):
     - rewards are divided by the size of the returns so far (SimbaV2, https://arxiv.org/abs/2502.15280, section 4.4), so
       that the critics' units stay the same while the policy improves;
     - states are z-scored, with the statistics of replay; actions and ages are in [-1, 1] as they are;
-    - in those units the entropy coefficient starts at 0.01, and the target is half of SAC's;
+    - in units of scaled rewards the entropy coefficient starts at 0.01, and the target entropy is half of SAC's;
     - actor and entropy coefficient are updated every second step (TD3, https://arxiv.org/abs/1802.09477, section 5.2);
-    - a running average of the actor's weights answers ``predict``, and is saved with it, while the actor itself
-      collects: one gradient step can move a return far (https://arxiv.org/abs/2309.14597), thousands of them less. It
+    - a running average of the actor's weights answers ``predict`` and is saved; the actor itself collects. One gradient
+      step can move a return far (https://arxiv.org/abs/2309.14597), an average over thousands moves less. The average
       waits while the training episodes have lost half of what was learned (like TD7's checkpoints, sac/episodes.py).
 
     With ``scale_rewards=False, normalise_states=False, policy_delay=1, actor_averaging=0.0, ent_coef="auto",
-    target_entropy="auto"`` it is ``DelayedSAC``, but for the order of an update, where the entropy coefficient
-    comes last, and for ``target_update_interval``, of which SB3 counts the gradient steps within one rollout, and this
-    all of them.
+    target_entropy="auto"`` it is ``DelayedSAC``, with two differences: an update changes the entropy coefficient
+    last, and ``target_update_interval`` counts all gradient steps, where SB3 counts those of each ``train`` call anew.
 
     :param policy: ``"MultiInputPolicy"`` or ``"MlpPolicy"``, which name the same class
     :param env: a task in a ``DelayedObservationWrapper``, or one with a 1-D Box observation (delay 0)
     :param learning_rate: of actor, critics and entropy coefficient; a number or a schedule
     :param scale_rewards: learn from rewards divided by :class:`~sb3_said.sac.scaling.ReturnScale`
     :param normalise_states: actor and critics read z-scores of states
-    :param policy_delay: updates of the critics for each of the actor
+    :param policy_delay: updates of the critics for each update of the actor
     :param actor_averaging: decay of the actor's average in each of its updates, in [0, 1); 0 for no average
     :param ent_coef: SAC's, in units of scaled rewards
     :param target_entropy: SAC's; ``"half"`` is -act_dim / 2, ``"auto"`` is -act_dim
-    :param critic_layer_norm: a LayerNorm follows each hidden layer of the critics, which bear ``gradient_steps=2`` with
-        it (DroQ, https://arxiv.org/abs/2110.02034). HalfCheetah-v5, whose episodes do not end by a fall, learns
-        faster with it; Hopper-v5 does not, and Walker2d-v5 falls for longer (results/expert_parts.md)
+    :param critic_layer_norm: a LayerNorm follows each hidden layer of the critics, so that these bear
+        ``gradient_steps=2`` (DroQ, https://arxiv.org/abs/2110.02034). HalfCheetah-v5, whose episodes do not end by a
+        fall, learns faster with it; Hopper-v5 does not, and Walker2d-v5 falls for longer (results/expert_parts.md)
     :param sac_kwargs: every other argument of :class:`DelayedSAC`
     :raises ValueError: as ``DelayedSAC`` does, and for a ``policy_delay`` or an ``actor_averaging`` out of range
     :raises TypeError: for an unknown argument
@@ -95,11 +94,11 @@ class StableSAC(DelayedSAC):
             self.target_entropy = -0.5 * float(np.prod(self.action_space.shape or ()))
         given = self.policy_kwargs
         if not {"optimizer_class", "optimizer_kwargs"} & set(given):
-            self.policy_kwargs = {**given, "optimizer_kwargs": {"fused": True}}  # Adam: a tenth of an update
+            self.policy_kwargs = {**given, "optimizer_kwargs": {"fused": True}}  # of Adam, saves a tenth of an update
         super()._setup_model()
         self.policy_kwargs = given
         if self.use_sde and self.policy.averaged_actor is not None:
-            self.policy.averaged_actor.reset_noise()  # which does not move to a GPU with the networks
+            self.policy.averaged_actor.reset_noise()  # its noise does not move to a GPU with the networks
 
     def _policy_flags(self) -> dict[str, Any]:
         return {
@@ -111,7 +110,7 @@ class StableSAC(DelayedSAC):
         }
 
     def _adapt_parameters(self, params: dict[str, Any]) -> dict[str, Any]:
-        """Let the actor of one that has no average be its average, and one whose training episodes lack know none."""
+        """Complete parameters without an average: their actor becomes it, their training episodes are empty."""
         params = super()._adapt_parameters(params)
         given = params.get("policy", {})
         if self.policy.averaged_actor is not None and any(name.startswith("actor.") for name in given):
@@ -141,7 +140,7 @@ class StableSAC(DelayedSAC):
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
-        """Read a replay as :class:`DelayedSAC` does; an agent that has seen no reward scales by those in it."""
+        """Read a replay as :class:`DelayedSAC` does; an agent that has seen no reward takes its scale from it."""
         super().load_replay_buffer(path, truncate_last_traj)
         scale, replay = self.policy.return_scale, self.replay_buffer
         if scale is None or scale.count >= 1.0 or replay.holds_logs or replay.size() == 0:
@@ -177,7 +176,7 @@ class StableSAC(DelayedSAC):
         row = replay_buffer.pos - 1
         begins = replay_buffer.steps[row] == 0  # (n_envs,), as the replay saw it
         if self.policy.return_scale is not None:
-            reward = np.asarray(reward, np.float32)  # as a DummyVecEnv has them, and environments in processes do not
+            reward = np.asarray(reward, np.float32)  # as a DummyVecEnv has them, and a SubprocVecEnv does not
             self._running_returns = running_return(reward, self._running_returns, begins, self.gamma)
             self.policy.return_scale.update(self._running_returns)
         if self.policy.training_episodes is not None:
@@ -187,10 +186,11 @@ class StableSAC(DelayedSAC):
                     self.policy.training_episodes.add(float(self._paid[i]), int(replay_buffer.steps[row, i]) + 1)
 
     def _look_at_states(self) -> None:
-        """Fit the z-scores to the states in replay, once there are a tenth more of them than last time.
+        """Fit the z-scores to the states in replay, once a tenth more environment steps have been taken than last time.
 
-        A replay with fewer is not looked at. An agent that goes on without its own would otherwise scale by a few
-        states of random actions, and its networks would see another task (measured, results/stable_expert.md).
+        A replay with fewer states than then is left out, unless it is full. An agent that goes on without its own
+        replay would otherwise scale by a few states of random actions, and its networks would see another task
+        (measured, results/stable_expert.md).
         """
         normalizer = self.policy.state_normalizer
         if normalizer is None:
@@ -204,12 +204,12 @@ class StableSAC(DelayedSAC):
             normalizer.fit(seen[UNDELAYED] if isinstance(seen, dict) else seen, self.num_timesteps)
 
     def _average_actor(self, waits: bool = False) -> None:
-        """Move the average towards the actor; while it is young it forgets in proportion to its age.
+        """Move the average towards the actor; a young average forgets faster.
 
-        That is the average by a power function of Karras et al. (https://arxiv.org/abs/2312.02696, section 3.1). A
+        While young it is the power-function average of Karras et al. (https://arxiv.org/abs/2312.02696, section 3.1). A
         plain mean of the first updates would hold what an agent did before it had learned anything.
 
-        :param waits: leave it where it is, if it is of as many updates as it is to remember
+        :param waits: leave the average as it is, once it is of as many updates as it is to remember
         """
         average, n = self.policy.averaged_actor, self._n_updates // self.policy_delay
         decay = min(self.actor_averaging, max(0.0, 1.0 - YOUTH / n))
@@ -219,7 +219,7 @@ class StableSAC(DelayedSAC):
         for own, averaged in zip(self.actor.buffers(), average.buffers(), strict=True):
             averaged.copy_(own)  # of a batch norm
         if self.use_sde:
-            average.reset_noise()  # of the spread that it has learned by now
+            average.reset_noise()  # with the spread that is learned by now
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Update critics, and every ``policy_delay`` steps actor and entropy coefficient, on batches from replay."""
@@ -229,7 +229,7 @@ class StableSAC(DelayedSAC):
         self._look_at_states()
         scale = 1.0 if self.policy.return_scale is None else self.policy.return_scale.value
         episodes = self.policy.training_episodes
-        waits = episodes is not None and episodes.have_collapsed  # none ends during the updates
+        waits = episodes is not None and episodes.have_collapsed  # no episode ends during the updates
         losses: dict[str, list[float]] = {"critic_loss": [], "actor_loss": [], "ent_coef_loss": []}
 
         for _ in range(gradient_steps):

@@ -1,4 +1,4 @@
-"""What an agent with a planner has, for what trains, tries and distills one."""
+"""What an agent with a planner has, for the modules that train, try and distill one."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ class PlannerAgent(OfflineAlgorithm):
 
     @property
     def has_expert(self) -> bool:
-        """Whether actor and critics have learned, here or where ``set_parameters`` has them from."""
+        """Whether actor and critics have learned, here or in the agent that ``set_parameters`` took them from."""
         return self._n_updates > 0 or len(self.actor.optimizer.state) > 0
 
     @property
     def newest_fraction(self) -> float:
-        """The part of the replay that is imitated: all of a log, no step of which is newer than another."""
+        """The part of the replay that is imitated; all of a log, where no step is newer than another."""
         return 1.0 if self.replay_buffer.holds_logs else self.planner_newest_fraction
 
     @property
     def planner_is_current(self) -> bool:
-        """Whether the planner has learned, and was tried, on all steps so far. After logs always False."""
+        """Whether :meth:`train_planner`, with its trial, has ended since the last step. After logs always False."""
         return self.policy.planner_is_trained and self._planner_trained_at == self.num_timesteps

@@ -26,7 +26,7 @@ class PlannerTrainingCallback(BaseCallback):
     :param make_trial_env: as of :meth:`~sb3_said.said.SAID.train_planner`
     :param intervals: in updates, ``log_interval``, ``eval_interval`` or ``save_interval`` of
         :meth:`~sb3_said.said.SAID.train_planner`
-    :raises TypeError: for another name, and where learning begins, for another algorithm
+    :raises TypeError: for another name; and when learning begins, for another algorithm
     :raises ValueError: for an interval below 1
     """
 
@@ -44,7 +44,7 @@ class PlannerTrainingCallback(BaseCallback):
         super().__init__(verbose)
         if unknown := sorted(set(intervals) - {"log_interval", "eval_interval", "save_interval"}):
             raise TypeError(f"PlannerTrainingCallback has no argument {', '.join(unknown)}.")
-        check_intervals(**intervals)  # and not when the planner is trained, after all of learn()'s steps
+        check_intervals(**intervals)  # here, since the planner is trained only after all of learn()'s steps
         how = {"progress_bar": progress_bar, "should_stop": should_stop, "make_trial_env": make_trial_env}
         self.how: dict[str, Any] = {"folder": folder, **how, **intervals}
 
@@ -65,12 +65,12 @@ class PlannerTrainingCallback(BaseCallback):
         # Here, and not in on_step, the replay buffer holds every step taken.
         freq, now = self.model.planner_train_freq, self.model.num_timesteps
         is_due = freq is not None and now // freq > self.model._planner_trained_at // freq
-        is_due &= self.model.replay_buffer.size() > 0  # which no agent has that was saved amid learn()
+        is_due &= self.model.replay_buffer.size() > 0  # an agent saved amid learn() is loaded with an empty one
         if is_due and self.model.has_expert and now > self.model.learning_starts:  # else it imitates random actions
-            self.model.train_planner(**self.how, trial_episodes=0)  # collection goes on, by the expert
+            self.model.train_planner(**self.how, trial_episodes=0)  # the expert goes on collecting, so none is tried
 
     def _on_training_end(self) -> None:
-        # A training that took no steps since the last one, or was ended twice, has nothing new to learn from.
+        # Without a step since the planner's last training there is nothing new to learn from.
         is_new = self.model._planner_trained_at != self.model.num_timesteps
         if is_new and self.model.replay_buffer.size() > 0:
             self.model.train_planner(**self.how)

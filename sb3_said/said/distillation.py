@@ -26,17 +26,17 @@ Labelled = tuple[th.Tensor, th.Tensor]  # what the student reads, (M, n_inputs),
 
 @dataclass(frozen=True)
 class Distillation:
-    """How a student learns. The values are ours; a quarter of these visits and a third of these updates kept 81 % of a
-    Hopper-v5 planner's return where these kept all of it (results/student.md).
+    """How a student learns. The values are ours: they kept all of a Hopper-v5 planner's return, where a quarter of the
+    visits and a third of the updates kept 81 % (results/student.md).
     """
 
     n_labels: int = 50_000
-    """answers of the planner to observations from the replay, drawn as its windows are, at ages drawn from all that it
+    """answers of the planner to observations from the replay, which are drawn like its windows, at any age that it
     plans at"""
     own_steps: int = 40_000
-    """and to those that the student visits itself (DAgger, Ross et al. 2011), over all rounds"""
+    """answers of the planner to observations that the student visits (DAgger, Ross et al. 2011), over all rounds"""
     rounds: int = 10
-    """of visiting and learning on, after the first learning"""
+    """how often the student visits observations and learns on, after it has learned from the replay"""
     gradient_steps: int = 60_000
     """updates, over all rounds"""
     batch_size: int = 256
@@ -52,8 +52,8 @@ class Distillation:
 def distill(model: PlannerAgent, config: Distillation, progress_bar: bool = False) -> float:
     """Train the policy's student, and return its error: the root mean square over labels that it did not learn from.
 
-    :param model: with a trained planner, and a replay or an environment; without a replay, the planner's own visits
-        take its place
+    :param model: with a trained planner, and a replay or an environment; without a replay, observations that the
+        planner visits take its place
     :param progress_bar: show one
     """
     model.policy.set_training_mode(False)
@@ -96,13 +96,13 @@ def _joined(parts: list[Labelled]) -> Labelled:
 
 def _student_of(model: PlannerAgent) -> Student:
     student = model.policy.student
-    assert student is not None  # whoever distills has made it
+    assert student is not None  # SAID.distill has made it
     return student
 
 
 @th.no_grad()
 def _labelled(model: PlannerAgent, parts: dict[str, th.Tensor]) -> Labelled:
-    """Ask the planner at temperature 0 about delayed observations, or the actor on its guess where that decides."""
+    """Ask the planner at temperature 0 about delayed observations, or the actor where the actor decides."""
     batches = zip(*(parts[key].split(LABELLED_AT_ONCE) for key in KEYS), strict=True)
     labels = [model.policy.answer_without_noise(dict(zip(KEYS, batch, strict=True))) for batch in batches]
     is_delayed = isinstance(model.observation_space, spaces.Dict)
@@ -126,7 +126,7 @@ def _replayed(model: PlannerAgent, source: WindowSource, generator: th.Generator
 
 
 def _visited(model: PlannerAgent, who: Answer, n_steps: int, generator: th.Generator) -> Labelled:
-    """Play the training environment, and label where that leads."""
+    """Play the training environment, and label the observations met there."""
     visited: list[dict[str, th.Tensor]] = []
     with model.borrowed_env() as env, model.policy.answering(who, at_once=True):
         env.seed(int(th.randint(2**31, (), generator=generator)))

@@ -72,10 +72,10 @@ def to_onnx(model: SAID, normalization: VecNormalize | None = None) -> Any:
     Its inputs are the keys of a delayed observation, float32: ``observation`` (B, obs_dim), ``action_history``
     (B, D, act_dim) and ``delay`` (B, 1); ``observation`` alone where the agent's task has no delay. Its output is
     ``action`` (B, act_dim), in the units of the action space. The metadata have ``max_delay``, the bounds of actions,
-    which the history is scaled by, and whether observations are to be normalised before: an agent of ``VecNormalize``
-    has its scale in the graph, where that is known here.
+    by which the history is scaled, and whether the caller has to normalise observations. The graph does so itself where
+    the statistics of the agent's ``VecNormalize`` are known here.
 
-    :param normalization: what the agent's observations are normalised by; its environment's by default
+    :param normalization: what normalises the agent's observations; that of its environment by default
     :raises ImportError: without the package onnx
     :raises ValueError: for an agent without a student
     """
@@ -85,7 +85,7 @@ def to_onnx(model: SAID, normalization: VecNormalize | None = None) -> Any:
             "This agent has no student to export. In Python: model = SAID.load(file, env=env); model.distill(); "
             "model.save(file)."
         )
-    assert student is not None  # who answers is there
+    assert student is not None  # it can answer
     state_space, space, max_delay = check_spaces(policy.observation_space, policy.action_space)
     scale = normalization or model.get_vec_normalize_env()
     statistics = get_statistics(scale).get("obs/observation")
@@ -121,13 +121,13 @@ def to_onnx(model: SAID, normalization: VecNormalize | None = None) -> Any:
 
 
 def _read_delay(graph: Graph, max_delay: int) -> tuple[str, str]:
-    """Add what reads history and delay: (B, D * act_dim), zero before the observation, and the delay's part of D."""
+    """Add what reads history and delay: actions since the observation, else zeros, (B, D * act_dim); and delay / D."""
     steps_ago = graph.constant(np.arange(max_delay, 0, -1))  # (D,)
     since = graph.add("LessOrEqual", steps_ago, "delay")  # (B, D)
     since = graph.add("Cast", since, to=graph.onnx.TensorProto.FLOAT)
     since = graph.add("Unsqueeze", since, graph.constant([2], np.int64))
     history = graph.add("Mul", "action_history", since)
-    flat = graph.add("Flatten", history, axis=1)  # also where D is 0, of which a Reshape could not tell B
+    flat = graph.add("Flatten", history, axis=1)  # a Reshape could not infer B where D is 0
     return flat, graph.add("Div", "delay", graph.constant(max(max_delay, 1)))
 
 
@@ -147,7 +147,7 @@ def _answer(graph: Graph, student: Student, x: str) -> str:
 def export(model: SAID, path: str | os.PathLike[str], normalization: VecNormalize | None = None) -> None:
     """Write :func:`to_onnx`'s graph to a file.
 
-    :param normalization: as there
+    :param normalization: as of :func:`to_onnx`
     :raises ImportError: without the package onnx
     :raises ValueError: for an agent without a student
     """

@@ -48,7 +48,7 @@ class PlannerLearner(PlannerAgent):
         self._check_scale()
         replay, newest, env = self.replay_buffer, self.newest_fraction, self._vec_normalize_env
         source = replay.window_source(newest, env)
-        has_older = len(source) < replay.size() * replay.n_envs  # a log's replay has one, whatever the agent has
+        has_older = len(source) < replay.size() * replay.n_envs  # not the agent's n_envs: a log's replay has 1
         bootstrap = self._stored_values if self.has_expert and not replay.holds_logs else None  # critics know no logs
         values = returns_to_go(source, self.gamma, self.planner_terminal_penalty, bootstrap)
         return PlannerTrainer(
@@ -74,31 +74,32 @@ class PlannerLearner(PlannerAgent):
         should_stop: Callable[[], bool] | None = None,
         make_trial_env: MakeEnv | None = None,
     ) -> None:
-        """Train the planner anew on the replay buffer, without running the expert; then see who answers better.
+        """Train the planner anew on the replay buffer, without running the expert; then play a trial of who is better.
 
-        Where a trial follows, each other ``mask`` that ``planner_ways`` names has a planner too, of as many updates.
-        The agent keeps the one that does best.
+        Where a trial follows, another planner is trained for each other ``mask`` that ``planner_ways`` names, with as
+        many updates. The agent keeps the best one.
 
         Interrupting (Ctrl-C) ends the training, or the trial, early and keeps the planner as far as it got. Until the
         training ends, and where it fails, the planner answers as before. Without ``verbose`` and a bar, one line says
-        that it begins.
+        that the training begins.
 
-        A row of the log is written at ``num_timesteps`` plus the updates made; with ``planner_train_freq`` at
-        ``num_timesteps`` alone, since the expert's rows go on from there.
+        A row of the log is written at ``num_timesteps`` plus the updates made. With ``planner_train_freq`` it is
+        written at ``num_timesteps`` alone, since the expert's rows go on from there.
 
         :param gradient_steps: ``planner_gradient_steps`` by default
         :param folder: keep a checkpoint there, and continue from it if it is of the same training
         :param progress_bar: show one
         :param log_interval: updates between two rows of losses in the log; None for one, at the end
-        :param eval_interval: updates between two measurements of the held-out errors, beside the regression's
+        :param eval_interval: updates between two measurements of the held-out errors, the planner's and the
+            regression's; they are measured only where ``log_interval`` has a row, too
         :param save_interval: updates between two checkpoints; by default ten minutes, and longer where they are large
         :param trial_episodes: ``planner_trial_episodes`` by default; none are played where there is no environment, or
             no expert to compare with
-        :param should_stop: asked after every update; where it says so, a checkpoint is written and the training ends
+        :param should_stop: asked after every update; if it returns True, a checkpoint is written and the training ends
         :param make_trial_env: makes a number of environments like the training's, as ``lambda n: make_vec_env(make,
             n)``. The trial plays in them at once, which is faster (results/settings.md); without it, or where it fails,
             in the training's own
-        :raises KeyboardInterrupt: when ``should_stop`` asks for the end
+        :raises KeyboardInterrupt: when ``should_stop`` has ended it
         :raises ValueError: for an interval below 1, when the buffer is empty, or the checkpoint is of a training with
             other settings
         :raises FloatingPointError: when an update was not finite
@@ -106,7 +107,7 @@ class PlannerLearner(PlannerAgent):
         check_intervals(log_interval=log_interval, eval_interval=eval_interval, save_interval=save_interval)
         n_episodes = self.planner_trial_episodes if trial_episodes is None else trial_episodes
         n_episodes = whole("trial_episodes", n_episodes, least=0)
-        learned_online = not self.replay_buffer.holds_logs  # of logs num_timesteps counts updates
+        learned_online = not self.replay_buffer.holds_logs  # else num_timesteps counts updates
         if learned_online and 0 < self.num_timesteps <= self.learning_starts:
             go_on = ", or with reset_num_timesteps=False" if self.has_expert else ""
             warnings.warn(
@@ -146,7 +147,7 @@ class PlannerLearner(PlannerAgent):
                 training.log(
                     let_the_best_answer(self, n_episodes, progress_bar, should_stop, planners[1:], make_trial_env)
                 )
-        # Asked amid the trial, the outcome is still "done"
+        # A stop that was asked for amid the trial leaves the outcome "done"
         if outcome == "stopped" or (should_stop is not None and should_stop()):
             raise KeyboardInterrupt
         self._planner_trained_at = self.num_timesteps
@@ -167,11 +168,13 @@ class PlannerLearner(PlannerAgent):
     ) -> SelfLearner:
         """Train the planner, and V(s) beside it, on logs of a task without delay (paper, Algorithm 2).
 
-        No environment is stepped and no expert is trained; the planner serves every delay 0..D, with ``mask="fixed"`` D
-        alone. Callbacks are called after each update, and meet a planner that is at most 100 updates old, after the
-        last one as it is. ``num_timesteps`` counts updates. From the first on the planner answers, by plans, and in the
-        default way where it decides in another of ``planner_ways``, as a trial chooses: none is played on logs. V(s)
-        scores candidates from then on (``value="iql"``), also where ``learn`` goes on.
+        No environment is stepped and no expert is trained. The planner serves every delay 0..D, with ``mask="fixed"`` D
+        alone. Callbacks are called after each update. They meet a planner that is at most 100 updates behind, and after
+        the last update the final one. ``num_timesteps`` counts updates.
+
+        From the first update on the planner answers, by plans. If a trial has chosen one of ``planner_ways``, the
+        default way takes its place, as no trial is played on logs. V(s) scores candidates from then on
+        (``value="iql"``), also where ``learn`` goes on.
 
         :param dataset: whatever :func:`~sb3_said.offline.load_dataset` reads; None for what ``take_dataset`` took
         :param gradient_steps: ``planner_gradient_steps`` by default
@@ -181,7 +184,7 @@ class PlannerLearner(PlannerAgent):
         :param reset_num_timesteps: has no effect: each training of a planner begins anew
         :param progress_bar: show one
         :param folder: keep a checkpoint there, and continue from it if it is of the same training
-        :param eval_interval: updates between two measurements of the held-out errors
+        :param eval_interval: as of :meth:`train_planner`
         :param save_interval: updates between two checkpoints; by default ten minutes, and longer where they are large
         :param should_stop: as of :meth:`train_planner`
         :raises KeyboardInterrupt: when ``should_stop`` has ended the training
@@ -194,7 +197,7 @@ class PlannerLearner(PlannerAgent):
             ways_of(self.planner_ways, self.policy.planner.config.to_dict(), "iql")  # refuses what V(s) cannot score
             watcher = self._begin_offline(dataset, total, callback, tb_log_name, True, progress_bar)
             self._check_decider(self.policy.planner.config.decided_by)
-            # An actor of the steps before would leave all that is learned here aside
+            # An actor would decide as it learned in earlier steps, whatever is learned here
             config = replace(self.policy.planner.config, decided_by="plan")
             if self.planner_ways and self._planner_trained_at > 0:
                 config = untried(config, self.planner_ways.values())
@@ -210,12 +213,12 @@ class PlannerLearner(PlannerAgent):
                 raise KeyboardInterrupt
             watcher.on_training_start(locals() | {"total_timesteps": total, "callback": watcher}, globals())
 
-        self._planner_trained_at = 0  # a trial's choice is undone, what is set from now on stays
+        self._planner_trained_at = 0  # a trial's choice was undone above; what is set from now on stays
         first = trainer.n_updates + 1
 
         def on_step(n_updates: int) -> bool:
             self.num_timesteps = n_updates
-            # After the first, too: until then the expert answers, which learns nothing
+            # After the first update, too: until then the expert answers, and it learns nothing here
             if n_updates in (first, total) or n_updates % HAND_OVER_INTERVAL == 0:
                 training.hand_over()
             return self._goes_on(watcher)
@@ -231,7 +234,7 @@ class PlannerLearner(PlannerAgent):
         return self
 
     def _planner_row(self, n_before: int, n_updates: int) -> int:
-        """Return where in the log a row of the planner stands, after updates of planners before it and its own."""
+        """Return where a planner's row stands in the log, by the updates of earlier planners and by its own."""
         return self.num_timesteps + (n_before + n_updates if self.planner_train_freq is None else 0)
 
     def _check_decider(self, decided_by: str | None) -> None:
@@ -241,18 +244,18 @@ class PlannerLearner(PlannerAgent):
 
     @th.no_grad()
     def _stored_values(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """Return values as the environment's rewards would sum up, of states as windows have them: (B,)."""
+        """Return Q(s, a) in units of the environment's rewards, for states and actions of windows: (B,)."""
         self.critic.set_training_mode(False)  # until the next update; batch norm must not learn from this
         values = self.policy.q_value(states.to(self.device), actions.to(self.device)).cpu()
         env = self._vec_normalize_env
         return values if env is None else th.from_numpy(env.unnormalize_reward(values.numpy()))
 
     def _make_value_trainer(self) -> IQL | None:
-        """Return a trainer of V(s) on the replay buffer, where that is who values plans."""
+        """Return a trainer of V(s) on the replay buffer; None where V(s) values no plans."""
         if self.policy.values is None:
             return None
         data, env = load_dataset(self.replay_buffer, self.observation_space, self.action_space), self._vec_normalize_env
-        if env is not None:  # V reads states as the planner has them
+        if env is not None:  # V reads states as the planner does
             normalized = self.replay_buffer.normalized
             data = replace(data, states=normalized(data.states, env), finals=normalized(data.finals, env))
         with seeded(self.seed or 0):
@@ -278,7 +281,7 @@ class PlannerLearner(PlannerAgent):
             warnings.warn(f"No trial is played, and the planner answers: {error}", stacklevel=3)
             return False
         n_stored = self.replay_buffer.size()
-        if n_stored == 0 or self.replay_buffer.dones[:n_stored].any():  # of an empty one the training itself tells
+        if n_stored == 0 or self.replay_buffer.dones[:n_stored].any():  # the training itself refuses an empty one
             return True
         warnings.warn(
             "No episode has ended in what the agent has stored, so a trial might never end: the planner answers as it "
@@ -289,9 +292,10 @@ class PlannerLearner(PlannerAgent):
 
     @contextmanager
     def _as_before_if_it_fails(self) -> Iterator[Callable[[], None]]:
-        """Take back what a training from logs changes before its planner is handed over, if it gets no further.
+        """Take back what a training from logs has changed, if it fails inside the context.
 
-        It gives the function that does, for a training that ends later, before that.
+        The context gives the function that takes it back, for a training that fails later, before its planner is handed
+        over.
         """
         names = "replay_buffer", "num_timesteps", "value", "_planner_trained_at"
         before, policy = {name: getattr(self, name) for name in names}, self.policy

@@ -31,13 +31,13 @@ Value = Literal["critics", "iql"]
 class SAIDPolicy(DelayedSACPolicy):
     """The expert's policy with an inpainting planner on top.
 
-    Until the planner is trained the expert answers, then whoever :meth:`set_answer` names; training names the planner.
-    At a temperature above 0 the expert's critics, or V(s), score its candidates.
+    Until the planner is trained the expert answers. A training lets the planner answer, and :meth:`set_answer` whoever
+    it names. At a temperature above 0 the expert's critics, or V(s), score the planner's candidates.
 
     :param planner_kwargs: fields of :class:`~sb3_said.planner.PlannerConfig`
     :param value: who values planned states: ``"critics"``, the expert's, by min Q(s, a); or ``"iql"``, a V(s) of its
-        own (see :class:`~sb3_said.offline.ImplicitValues`), which scores the states after the decision where
-        ``scored_states`` is ``"decision"``: no action shows in V of the present that all candidates share
+        own (see :class:`~sb3_said.offline.ImplicitValues`). Where ``scored_states`` is ``"decision"``, V(s) scores the
+        states after the decision: at the present, which all candidates share, it tells no action from another
     :param iql_kwargs: fields of :class:`~sb3_said.offline.IQLConfig`, of that V(s)
     :param student_width: of the hidden layers of a :class:`~sb3_said.said.student.Student`; None for none
     :param policy_kwargs: of :class:`~sb3_said.sac.DelayedSACPolicy`
@@ -69,7 +69,7 @@ class SAIDPolicy(DelayedSACPolicy):
         config = settings_of(PlannerConfig, planner_kwargs, "The planner")
         self.iql_config: IQLConfig = settings_of(IQLConfig, iql_kwargs, "IQL")
         self.register_buffer("planner_updates", th.zeros(()))
-        self.register_buffer("expert_preferred", th.zeros(()))  # part of the ages, from 0 on, at which it answers
+        self.register_buffer("expert_preferred", th.zeros(()))  # part of the ages that it has, see expert_ages
         self.values: ImplicitValues | None = None
         with th.random.fork_rng(devices=[]):  # the expert learns as it would without a planner
             self.make_planner(config)
@@ -91,7 +91,7 @@ class SAIDPolicy(DelayedSACPolicy):
         self.expert_preferred.zero_()
 
     def take_planner(self, planner: InpaintingPlanner, config: PlannerConfig) -> None:
-        """Let a trained planner decide from now on, in the way that these settings of it say."""
+        """Let a planner decide from now on, in the way that these settings say."""
         planner.config = config
         self.planner = planner
 
@@ -115,7 +115,7 @@ class SAIDPolicy(DelayedSACPolicy):
             self.planner.config = self._scored(self.planner.config)
 
     def _scored(self, config: PlannerConfig) -> PlannerConfig:
-        """Return settings under which V(s), where there is one, tells candidates apart."""
+        """Return settings with which V(s), where there is one, tells candidates apart."""
         is_blind = self.values is not None and config.scored_states == "decision"
         return replace(config, scored_states="future") if is_blind else config
 
@@ -160,21 +160,21 @@ class SAIDPolicy(DelayedSACPolicy):
         return 0 < len(self.expert_ages) <= self.max_delay
 
     def set_answer(self, who: Answer, expert_up_to: int | None = None, expert_from: int | None = None) -> None:
-        """Let one of them answer ``predict`` from now on, or two; a file keeps it.
+        """Set who answers ``predict`` from now on; a file keeps it.
 
-        Where two do, the one that has the oldest observations begins each episode, until an observation arrives that an
-        action has led to.
+        With ``"both"``, the one that answers at age D begins each episode, until an observation arrives that an action
+        has led to.
 
-        :param who: ``"planner"``, ``"expert"``, ``"student"``, or ``"both"``, each at ages of its own
-        :param expert_up_to: with ``"both"``, the largest age at which the expert answers, in control steps, and the
-            planner beyond
-        :param expert_from: in its place, the smallest age at which the expert answers, and the planner below
+        :param who: ``"planner"``, ``"expert"``, ``"student"``, or ``"both"``: planner and expert, each at its own ages
+        :param expert_up_to: with ``"both"``, the largest age at which the expert answers, in control steps; the planner
+            answers beyond
+        :param expert_from: in its place, the smallest age at which the expert answers; the planner answers below
         :raises ValueError: for another name, for a planner that is not trained, for no student, or for ages that leave
-            one of both without any
+            planner or expert without any
         """
         n_ages, part = self.max_delay + 1, float(who == "expert")
         if who == "both":
-            n = 0  # of the expert's ages; those of the oldest are written as less than 0
+            n = 0  # how many ages the expert has, below 0 where they are the largest
             if expert_up_to is not None and expert_from is None and 0 <= expert_up_to < self.max_delay:
                 n = expert_up_to + 1
             elif expert_from is not None and expert_up_to is None and 0 < expert_from <= self.max_delay:
@@ -199,7 +199,7 @@ class SAIDPolicy(DelayedSACPolicy):
 
     @contextmanager
     def answering(self, who: Answer, at_once: bool = False) -> Iterator[None]:
-        """Let one of them answer ``predict`` inside the context, whatever :meth:`set_answer` said.
+        """Set who answers ``predict`` inside the context, whatever :meth:`set_answer` said.
 
         :param who: as of :meth:`set_answer`
         :param at_once: answer the rows of a batch together: several times as fast, but an answer then differs by
@@ -217,11 +217,11 @@ class SAIDPolicy(DelayedSACPolicy):
 
     @contextmanager
     def preferring_who_answers(self) -> Iterator[None]:
-        """Write who answers inside :meth:`answering` into the buffers that a file keeps, and take it back."""
+        """Let the buffers that a file keeps say who answers now, as :meth:`answering` set it; restore them after."""
         parts = [self.expert_preferred] if self.student is None else [self.expert_preferred, self.student.preferred]
         before = [part.clone() for part in parts]
         if self._answer == "both" and self.student is not None:
-            self.student.preferred.fill_(0.0)  # the ages are there
+            self.student.preferred.fill_(0.0)  # expert_preferred has the ages already
         elif self._answer is not None and self._answer != "both":
             self.set_answer(self._answer)
         try:
@@ -247,14 +247,14 @@ class SAIDPolicy(DelayedSACPolicy):
         """Return V(s), or min over the critics of Q(s, a), which scores candidates (MCSS).
 
         :param states: (..., obs_dim)
-        :param actions: (..., act_dim) in [-1, 1]; V(s) does without
+        :param actions: (..., act_dim) in [-1, 1]; V(s) does not read them
         :return: (...)
         """
         return self.q_value(states, actions) if self.values is None else self.values.value(states)
 
     def q_value(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """Return min over the critics of Q(s, a), in units of the rewards that they learn from: (...)."""
-        if self.critic.training:  # SB3 leaves it so; Dropout would draw, and BatchNorm learn from plans
+        if self.critic.training:  # as SB3 leaves it; Dropout would then draw, and BatchNorm learn from plans
             self.critic.set_training_mode(False)
         flat = states.flatten(0, -2)
         observation: PyTorchObs = flat if self.replay_space is None else {UNDELAYED: flat}
@@ -271,7 +271,7 @@ class SAIDPolicy(DelayedSACPolicy):
         if self.who_answers != "student":
             return super().predict(observation, state, episode_start, deterministic)
         assert self.student is not None
-        arrays, is_batch = self.obs_to_arrays(observation)  # SB3's way would set the mode of every module first
+        arrays, is_batch = self.obs_to_arrays(observation)  # SB3's predict would set the mode of every module first
         rows = ({key: x[i : i + 1] for key, x in arrays.items()} for i in range(len(arrays["observation"])))
         answers = np.concatenate([self.student.react(row) for row in rows])
         actions = self._checked(self.unscale_action(answers), observation)
@@ -299,9 +299,9 @@ class SAIDPolicy(DelayedSACPolicy):
         return super()._predict(observation if is_experts else self._as_if_seen(observation), deterministic)
 
     def answer_without_noise(self, observation: dict[str, th.Tensor]) -> th.Tensor:
-        """Return what the planner decides at temperature 0, or the actor on its guess where that decides: (B, act_dim).
+        """Return what the planner decides at temperature 0: (B, act_dim). With ``decided_by="actor"``, ask the actor.
 
-        :param observation: of (B, ...), as of a delayed task; without delay, its history has no steps
+        :param observation: (B, ...) by key, as of a delayed task; without delay its history has no steps
         """
         if self.planner.config.decided_by == "actor":
             is_delayed = isinstance(self.observation_space, spaces.Dict)
@@ -311,7 +311,7 @@ class SAIDPolicy(DelayedSACPolicy):
         return self.planner.plan(*known, **extra, temperature=0.0).action
 
     def _as_if_seen(self, observation: PyTorchObs) -> PyTorchObs:
-        """Return observations of age 0, of the present that the planner's first guess has for each row."""
+        """Return the present that the planner's first guess has for each row, as an observation of age 0."""
         if not isinstance(observation, dict):
             return observation
         known, extra = _known(observation)
@@ -321,13 +321,13 @@ class SAIDPolicy(DelayedSACPolicy):
     def _is_experts(self, observation: PyTorchObs, who: Answer) -> th.Tensor:
         """Tell for which observations the expert decides: (B,) bool.
 
-        Where both do, the one that decides at the largest age begins: while s_0 is all that has arrived, the age still
-        grows, and a planner that takes over from the expert amid its first steps falls (measured,
+        Where both do, the one that decides at age D begins the episode. While s_0 is all that has arrived, the age
+        still grows, and a planner that takes over from the expert amid the first steps falls (measured,
         results/agents_before.md).
         """
         if who == "both" and isinstance(observation, dict):
             history, age = observation["action_history"], observation["delay"][:, 0].long()  # (B, D, act_dim), (B,)
-            n_before = self.max_delay - age[:, None]  # of the actions a_{t-D..t-d-1}, zeros where s_{t-d} is s_0
+            n_before = self.max_delay - age[:, None]  # how many actions a_{t-D..t-d-1}; zeros where s_{t-d} is s_0
             has_led_there = history.ne(0).any(2) & (th.arange(self.max_delay, device=age.device) < n_before)  # (B, D)
             begins, ages = ~has_led_there.any(1), self.expert_ages
             is_its_age = (age >= ages.start) & (age < ages.stop)
@@ -337,11 +337,10 @@ class SAIDPolicy(DelayedSACPolicy):
 
     @th.no_grad()
     def predict_plan(self, observation: np.ndarray | dict[str, np.ndarray], deterministic: bool = False) -> np.ndarray:
-        """Return the action that :meth:`predict` does, and those planned for the steps after it.
+        """Return the action that :meth:`predict` returns, and those planned for the steps after it.
 
-        Of candidates that are chosen from, they are the best one's; of weighed ones, their weighed mean, too. Where
-        ``"both"`` answer and the expert decides, or its actor on the guessed present, the planner still plans what
-        follows.
+        The later ones are the best candidate's, or with ``choice_factor`` the weighed mean. Where the expert decides
+        (with ``"both"``), or its actor on the guessed present, the planner still plans what follows.
 
         :param observation: (B, ...), as of ``predict``; one alone is a batch of one
         :return: (B, K, act_dim), in the units of the action space. K is the planner's ``horizon``; 1 where the planner
@@ -365,7 +364,7 @@ class SAIDPolicy(DelayedSACPolicy):
     def _plan(self, observation: PyTorchObs, repeats: bool = False) -> Plan:
         """Plan for each row.
 
-        :param repeats: let each row decide its noise
+        :param repeats: derive the noise of each row from the row alone
         """
         known, extra = _known(as_delayed(observation, self.planner.act_dim))
         chooses = self.planner.config.temperature > 0  # else there is no noise and one candidate
@@ -379,8 +378,8 @@ class SAIDPolicy(DelayedSACPolicy):
     def _noise_of(self, row: PyTorchObs) -> th.Tensor:
         """Return noise that the observation alone decides: (N, L, obs_dim + act_dim).
 
-        It repeats where the observation does, and leaves the global random state alone. One noise for all observations
-        would favour the same few candidates at every step, and their errors would add up.
+        It repeats where the observation does, and the global random state stays as it is. One noise for all
+        observations would favour the same few candidates at every step, and their errors would add up.
         """
         planner = self.planner
         shape = (planner.config.n_candidates, planner.window_length, planner.obs_dim + planner.act_dim)
@@ -391,7 +390,7 @@ class SAIDPolicy(DelayedSACPolicy):
 
         The first calls choose a CPU's kernels and record a GPU's graph.
 
-        :param batch_size: observations of a later ``predict``
+        :param batch_size: number of observations in a later ``predict``
         :raises ValueError: for a batch_size below 1
         """
         if batch_size < 1:
@@ -411,7 +410,7 @@ class SAIDPolicy(DelayedSACPolicy):
                     self.predict(obs, deterministic=deterministic)
 
     def save(self, path: PathOrFile) -> None:
-        """Write all that ``predict`` needs to a file, which answers as the policy does now; amid ``learn`` the expert.
+        """Write all that ``predict`` needs to a file. Who answers now will answer there: amid ``learn`` the expert.
 
         :param path: where to write, as it is. Or a binary file object.
         :raises ValueError: if a constructor argument cannot be written without pickle

@@ -36,9 +36,9 @@ class SAID(PlannerLearner, StableSAC):
     """State-Action Inpainting Diffuser, online (paper, Algorithm 1) and offline (Algorithm 2).
 
     ``learn`` runs the expert (:class:`~sb3_said.sac.StableSAC`), then trains a diffusion transformer on windows of its
-    replay buffer. ``predict`` asks the expert until the planner is trained, and then whoever of the two does better in
-    a few episodes, which also tell how the planner decides best. The planner inpaints what the delay hides and the plan
-    behind it; at a temperature above 0 many times, and the critics choose. Collection always uses the expert.
+    replay buffer. ``predict`` asks the expert until the planner is trained. Then a trial of a few episodes chooses who
+    answers, and how the planner decides. The planner inpaints what the delay hides and the plan after it. At a
+    temperature above 0 it draws many candidates, and the critics choose. Collection always uses the expert.
     ``learn_offline`` trains the planner on logs instead, without an expert.
 
     :param policy: ``"MultiInputPolicy"`` or ``"MlpPolicy"``, which name the same class
@@ -46,24 +46,24 @@ class SAID(PlannerLearner, StableSAC):
     :param learning_rate: of the expert
     :param planner_kwargs: fields of :class:`~sb3_said.planner.PlannerConfig`; the attribute has all of them
     :param planner_gradient_steps: updates of one planner training; the paper makes 1,000,000
-    :param planner_train_freq: also train the planner every so many environment steps, once the expert learns; the paper
-        only at the end (None)
+    :param planner_train_freq: also train the planner every so many environment steps, once the expert learns; None, as
+        in the paper, only at the end
     :param planner_newest_fraction: train on the newest part of the buffer only. The paper takes all of it (Algorithm 1)
-        and finds the newest 20 % as good; here they are better, where policies change fast
+        and finds the newest 20 % as good; here these are better, as policies change fast
     :param planner_terminal_penalty: replaces the reward of a terminating step in the values that weigh windows. The
         paper's Table 3 has -100, for tasks that end by falling, and the presets of such tasks have it too; None keeps
         the reward, for tasks that may end because they are done
-    :param planner_trial_episodes: of the training environment, played after the planner's training, a quarter of them
-        (at least one in each environment) in each of its ways to decide, the others in the three best, and all with the
-        expert; the best one answers. They come on top of ``learn``'s steps. 0: the planner answers, as
-        ``planner_kwargs`` says
-    :param planner_ways: names and settings of :meth:`set_planner` to compare with those of ``planner_kwargs``, or a
-        ``mask``, for which a second planner is trained; by default :data:`~sb3_said.said.ways.WAYS`, or none where
-        ``planner_kwargs`` has settings of ``set_planner``. A planner of ``mask="own"`` is left out where not every age
-        was trained on, and on logs
+    :param planner_trial_episodes: episodes of the trial, played in the training environment after the planner's
+        training, on top of ``learn``'s steps. Each of the planner's ways to decide plays a quarter of them (at least
+        one in each environment), the three best and the expert play all, and the best one answers. With 0 the planner
+        answers as ``planner_kwargs`` says
+    :param planner_ways: the ways to decide that are compared with ``planner_kwargs``, by name: settings of
+        :meth:`set_planner`, or a ``mask``, for which a second planner is trained. By default
+        :data:`~sb3_said.said.ways.WAYS`, or none where ``planner_kwargs`` has settings of ``set_planner``. A planner of
+        ``mask="own"`` is left out where not every age was trained on, and on logs
     :param value: who scores the planner's candidates: ``"critics"``, the expert's, by min Q(s, a); or ``"iql"``, a
-        V(s) that is learned beside the planner by implicit Q-learning, which is what offline learning has
-    :param iql_kwargs: fields of :class:`~sb3_said.offline.IQLConfig`, how that V(s) is learned, such as
+        V(s) that implicit Q-learning learns beside the planner, as offline learning always does
+    :param iql_kwargs: fields of :class:`~sb3_said.offline.IQLConfig` for learning that V(s), such as
         ``{"expectile": 0.9}``; the attribute has all of them
     :param student_width: of the hidden layers of the student that :meth:`distill` trains; None for its default
     :param sac_kwargs: every other argument of :class:`~sb3_said.sac.StableSAC`, the expert, and of SB3's ``SAC``
@@ -136,7 +136,7 @@ class SAID(PlannerLearner, StableSAC):
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        if self.trained_ages is None and self.env is not None:  # else it was loaded, and check_ages says it
+        if self.trained_ages is None and self.env is not None:  # else it was loaded, and set_env checks the ages
             try:
                 self.policy.planner.check_ages(ages_of(self.env))
             except ValueError as error:  # no error yet: the expert may learn under another delay
@@ -157,9 +157,9 @@ class SAID(PlannerLearner, StableSAC):
         super()._refuse_unknown(given, known)
 
     def _check_file(self, saved: dict[str, Any]) -> None:
-        """Refuse a trained planner of other settings than this agent's, of which its weights mean something else.
+        """Refuse a trained planner of other settings than this agent's, with which its weights mean something else.
 
-        And a student where this agent has none, or one of another width.
+        Refuse a student, too, where this agent has none, or one of another width.
         """
         super()._check_file(saved)
         policy = saved["parameters"]["policy"]
@@ -185,7 +185,7 @@ class SAID(PlannerLearner, StableSAC):
             )
 
     def _take_settings(self, saved: dict[str, Any]) -> None:
-        """Decide as the planner of a checkpoint, whose trial may have chosen otherwise than the arguments of both."""
+        """Decide as the planner of a checkpoint does: its trial may have chosen another way than the arguments."""
         super()._take_settings(saved)
         if not saved["parameters"]["policy"].get("planner_updates", 0):
             return
@@ -220,8 +220,8 @@ class SAID(PlannerLearner, StableSAC):
     ) -> SelfSAID:
         """Run the expert for ``total_timesteps``, then train the planner on what it stored.
 
-        A :class:`PlannerTrainingCallback` among the callbacks trains the planner, and otherwise one that is added. The
-        expert answers all callbacks, such as ``EvalCallback``, also when the planner has been trained before.
+        A :class:`PlannerTrainingCallback` trains the planner: one among the callbacks, else one that is added. The
+        expert answers in all callbacks, such as ``EvalCallback``, also when the planner has been trained before.
         """
         if self.policy.planner_is_trained and self.replay_buffer.size() == 0:
             warnings.warn(
@@ -229,7 +229,7 @@ class SAID(PlannerLearner, StableSAC):
                 "new steps alone. load_replay_buffer() before learn() brings back what it learned from.",
                 stacklevel=2,
             )
-        # After the user's own it has nothing to do
+        # If the user has given one, it trains the planner first, and this one has nothing to do
         callbacks = [*listed(callback), PlannerTrainingCallback(progress_bar=progress_bar)]
         with self.policy.answering("expert"):
             return super().learn(
@@ -242,7 +242,7 @@ class SAID(PlannerLearner, StableSAC):
             )
 
     def save(self, path: PathOrFile, compact: bool = False) -> None:  # type: ignore[override]  # no exclude, include
-        """Write the agent to a file, which answers as the agent does now; amid ``learn`` that is the expert.
+        """Write the agent to a file. Who answers now will answer there: amid ``learn`` the expert.
 
         The arguments are those of :meth:`DelayedSAC.save`.
         """
@@ -255,7 +255,7 @@ class SAID(PlannerLearner, StableSAC):
     ) -> SelfSAID:
         """Build an agent from a file, as :meth:`DelayedSAC.load` does.
 
-        As in the constructor, ``planner_kwargs`` that say how to decide leave a later ``learn`` no ways to try.
+        As in the constructor, a later ``learn`` tries no other ways where ``planner_kwargs`` say how to decide.
 
         :raises ValueError: as it does, and for ``decided_by="actor"`` where a planner has learned and no expert
         """
@@ -274,9 +274,9 @@ class SAID(PlannerLearner, StableSAC):
 
         :param settings: ``sampling_steps``, ``n_candidates``, ``temperature``, ``scored_states``, ``choice_factor``,
             ``present`` or ``decided_by`` of :class:`~sb3_said.planner.PlannerConfig`
-        :raises ValueError: for other settings, which the weights depend on, for values outside their range, for
-            ``scored_states="decision"`` where V(s) scores, in which no action shows, and for ``decided_by="actor"``
-            where no expert has learned
+        :raises ValueError: for other settings, on which the weights depend; for values outside their range; for
+            ``scored_states="decision"`` where V(s) scores, which sees no action; and for ``decided_by="actor"`` where
+            no expert has learned
         """
         for name in sorted(set(settings) - set(SAMPLING_SETTINGS)):
             is_one = name in self.planner_kwargs
@@ -287,9 +287,9 @@ class SAID(PlannerLearner, StableSAC):
         self.policy.planner.config = replace(self.policy.planner.config, **settings)
 
     def set_answer(self, who: Answer, expert_up_to: int | None = None, expert_from: int | None = None) -> None:
-        """Let one of them answer ``predict`` from now on, or two: see :meth:`SAIDPolicy.set_answer`.
+        """Set who answers ``predict`` from now on: see :meth:`SAIDPolicy.set_answer`.
 
-        :raises ValueError: as it does, and for an expert that has learned nothing, where the planner has
+        :raises ValueError: as it does, and for an expert that has learned nothing where the planner has
         """
         if who in ("expert", "both") and not self.has_expert and self.policy.planner_is_trained:
             raise ValueError(
@@ -304,18 +304,18 @@ class SAID(PlannerLearner, StableSAC):
         """
         who = self.policy.who_answers
         acts_at = [age for age in ages if who == "expert" or (who == "both" and age in self.policy.expert_ages)]
-        if who != "expert":  # masks were drawn from all of 0..D, so it has met every age
+        if who != "expert":  # the planner's masks were drawn from all of 0..D, whatever the ages in training
             self.policy.planner.check_ages([age for age in ages if age not in acts_at])
         if who in ("planner", "both") and self.policy.planner.config.decided_by == "actor":
-            acts_at.append(0)  # on the present, as if it saw it
+            acts_at.append(0)  # the guessed present, as if it were seen
         return acts_at
 
     def distill(self, width: int | None = None, progress_bar: bool = False, **settings: Any) -> float:
         """Train a student: a plain network that answers as the planner does at temperature 0, much faster.
 
-        It learns from the planner's answers to observations of the replay, at every age, and to those that it visits
-        itself in the training environment, within ten minutes on one core. ``save`` keeps it. To use it,
-        ``set_answer("student")``. It does not change where the planner is trained again.
+        The student learns from the planner's answers to observations of the replay, at every age, and to those that the
+        student visits in the training environment. This takes less than ten minutes on one core. ``save`` keeps the
+        student, and ``set_answer("student")`` lets it answer. A later training of the planner does not change it.
 
         :param width: of its two hidden layers; by default ``student_width``, or 256 where that is None
         :param progress_bar: show one
@@ -351,6 +351,6 @@ class SAID(PlannerLearner, StableSAC):
     def warmup(self, batch_size: int = 1) -> None:
         """Run a few dummy predictions: see :meth:`SAIDPolicy.warmup`. A control loop calls it once before it starts.
 
-        :param batch_size: observations of a later ``predict``
+        :param batch_size: number of observations in a later ``predict``
         """
         self.policy.warmup(batch_size)

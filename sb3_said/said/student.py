@@ -18,7 +18,7 @@ from sb3_said.sac.policies import as_array
 
 
 class Student(ZScored):
-    """Reads [newest observation, actions since, age / D], z-scored, as the expert's actor does without the z-scores.
+    """Reads what the expert's actor reads, [newest observation, actions since, age / D], but z-scored.
 
     :param observation_space: of the agent
     :param action_space: (act_dim,)
@@ -35,26 +35,26 @@ class Student(ZScored):
         n_inputs, act_dim = reader.features_dim if reader else state_space.shape[0], action_box.shape[0]
         super().__init__(n_inputs)
         self.width, self.max_delay, self.reader = width, max_delay, reader
-        self.register_buffer("preferred", th.zeros(()))  # 1: it answers
+        self.register_buffer("preferred", th.zeros(()))  # 1 where it answers
         self.network = nn.Sequential(*plain_network(n_inputs, act_dim, width), nn.Tanh())
 
     def read(self, observation: PyTorchObs) -> th.Tensor:
-        """Return what it reads: (B, n_inputs)."""
+        """Return what the student reads of observations: (B, n_inputs)."""
         if self.reader is None:
             assert isinstance(observation, th.Tensor)
             return observation
         return self.reader(observation)
 
     def answer(self, inputs: th.Tensor) -> th.Tensor:
-        """Return actions in [-1, 1] for what it has read: (B, act_dim)."""
+        """Return actions in [-1, 1] for inputs of :meth:`read`: (B, act_dim)."""
         return self.network(self._z(inputs))
 
     def react(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         """Answer one observation as :meth:`answer` does, in NumPy: (1, act_dim).
 
-        Sixteen calls of torch take five times as long as what they compute (results/student.md).
+        PyTorch's sixteen calls would take five times as long as the computation itself (results/student.md).
 
-        :param observation: arrays (1, ...) by key, "observation" alone without delay
+        :param observation: arrays (1, ...) by key; without delay "observation" alone
         """
         x = observation["observation"]
         if self.reader is not None:
@@ -71,7 +71,7 @@ class Student(ZScored):
 
 
 def as_delayed(observation: PyTorchObs, act_dim: int) -> dict[str, th.Tensor]:
-    """Return observations as a delayed task has them; of one without delay, of age 0 and without a history."""
+    """Return observations as a delayed task has them; those without delay get the age 0 and an empty history."""
     if isinstance(observation, dict):
         return observation
     n = len(observation)

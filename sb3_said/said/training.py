@@ -21,11 +21,11 @@ from sb3_said.planner.trainer import PlannerTrainer, worse_than_regression
 from sb3_said.said.agent import PlannerAgent
 
 PLANNER_CHECKPOINT_NAME = "planner_checkpoint.zip"
-SECOND_CHECKPOINT_NAME = "planner_{mask}_checkpoint.zip"  # of one of another mask than the default's
+SECOND_CHECKPOINT_NAME = "planner_{mask}_checkpoint.zip"  # of a planner with another mask than the default
 
 
 def planner_checkpoint(folder: Path, mask: str) -> Path:
-    """Return where the training of a planner is kept: by its mask, as a trial may make another the agent's own."""
+    """Return a planner's checkpoint. It is named by the mask, as a trial may make another planner the agent's own."""
     is_first = mask == PlannerConfig.mask
     return folder / (PLANNER_CHECKPOINT_NAME if is_first else SECOND_CHECKPOINT_NAME.format(mask=mask))
 
@@ -36,9 +36,9 @@ class PlannerTraining:
     :param model: whose planner it is
     :param trainer: of the planner
     :param value_trainer: trained beside it, None for none
-    :param row: maps the updates made to where in the log their row stands
+    :param row: maps the number of updates made to where their row stands in the log
     :param folder: this and the next three as of :meth:`~sb3_said.said.SAID.train_planner`
-    :param watcher: whose ``EvalCallback`` evaluations the checkpoint keeps, too
+    :param watcher: callbacks, whose ``EvalCallback`` evaluations the checkpoint keeps, too
     :raises SavedFileError: when the checkpoint is damaged, of a training with other settings, or of one on other logs
     """
 
@@ -56,7 +56,7 @@ class PlannerTraining:
     ):
         self.model, self.trainer, self.value_trainer, self.row = model, trainer, value_trainer, row
         self.log_interval, self.eval_interval, self.save_interval = log_interval, eval_interval, save_interval
-        self.is_agents = trainer.planner is model.policy.planner  # or one beside it, for a trial
+        self.is_agents = trainer.planner is model.policy.planner  # else it is another one, for a trial
         mask = trainer.config.mask
         self.name = "planner" if self.is_agents else f"planner of mask={mask!r}"
         self._clock = None if folder is None else CheckpointClock(planner_checkpoint(Path(folder), mask))
@@ -75,7 +75,7 @@ class PlannerTraining:
                     if value_trainer is not None:
                         value_trainer.load_state_dict(state["values"])
                     restore_evaluations(watcher, state["evaluations"])
-                elif watcher is not None:  # learning from logs, which one training in a folder does
+                elif watcher is not None:  # on logs, where a folder has one training alone
                     raise ValueError("it is of a training on other data; give the same logs, or another folder")
 
     def run(
@@ -86,9 +86,9 @@ class PlannerTraining:
     ) -> Literal["done", "interrupted", "stopped"]:
         """Make all updates that are left, and hand over. Ctrl-C ends the training early and keeps what was learned.
 
-        :param should_stop: asked after every update; where it says so, a checkpoint is written and the training ends;
-            none of the first guess, which takes minutes
-        :param on_step: called with the number of updates made after each; the training ends when it returns False
+        :param should_stop: asked after every update; if it returns True, a checkpoint is written and the training ends.
+            While the first guess learns, which takes minutes, no checkpoint is written
+        :param on_step: called after each update with the number made; the training ends when it returns False
         :return: ``"interrupted"`` after Ctrl-C, ``"stopped"`` where ``should_stop`` asked for the end
         """
         trainer, total = self.trainer, self.trainer.gradient_steps
@@ -102,7 +102,7 @@ class PlannerTraining:
             self._train_values()
             if is_end or (self.log_interval is not None and done % self.log_interval == 0):
                 bar.set_postfix(loss=self._log_row(done % self.eval_interval == 0 or is_end))
-            goes_on = on_step is None or on_step(done)  # first: a checkpoint keeps what callbacks counted
+            goes_on = on_step is None or on_step(done)  # before the checkpoint, which keeps what callbacks counted
             outcome = "stopped" if should_stop is not None and should_stop() else "done"
             clock = self._clock
             if clock is not None and (self._is_due(clock, done) or is_end or outcome == "stopped"):
@@ -124,7 +124,7 @@ class PlannerTraining:
         return outcome
 
     def hand_over(self) -> None:
-        """Give the planner its weights and the agent the values as far as they got; before the first update, none.
+        """Give the planner its weights, and the agent V(s), as far as trained; before the first update, change nothing.
 
         An agent's own planner answers from then on.
 
@@ -137,11 +137,11 @@ class PlannerTraining:
             self.model.policy.set_answer("planner")
             if self.value_trainer is not None:
                 values = self.model.policy.values
-                assert values is not None  # which it trains
+                assert values is not None  # else it would have no trainer
                 values.load_state_dict(self.value_trainer.values.state_dict())
 
     def log(self, values: Mapping[str, float | str]) -> None:
-        """Write a row to the agent's logger, which keeps what it holds for its next one."""
+        """Write a row to the agent's logger. What the logger holds already stays for its next row."""
         logger = self.model.logger
         pending: list[tuple[Any, Any]] = [
             (x, x.copy()) for x in (logger.name_to_value, logger.name_to_count, logger.name_to_excluded)
@@ -154,7 +154,7 @@ class PlannerTraining:
         logger.record("time/total_timesteps", row, exclude="tensorboard")  # as SB3's evaluations do: a CSV has no other
         logger.dump(row)
         for entries, before in pending:
-            entries.clear()  # a logger that is disabled has not written them
+            entries.clear()  # a disabled logger has not cleared them
             entries.update(before)
 
     def _is_due(self, clock: CheckpointClock, n_updates: int) -> bool:

@@ -18,17 +18,17 @@ from sb3_said.planner import InpaintingPlanner
 from sb3_said.said.agent import PlannerAgent
 from sb3_said.said.ways import players_of
 
-MakeEnv = Callable[[int], VecEnv]  # of a number of environments
+MakeEnv = Callable[[int], VecEnv]  # makes as many environments as it is told
 
-CUT_AT = 10  # times the longest stored episode: a good answer may never end one
+CUT_AT = 10  # times the longest stored episode: a good policy may never end one
 FIRST_PART = 0.25  # of a trial's episodes, which all ways play
 AT_ONCE = 5  # environments: a CPU core decides for each in .25 to .39 of the time (measured, results/settings.md)
-GO_ON = 3  # ways that play the others, too (simulated with episodes of 30 planners, results/settings.md)
+GO_ON = 3  # ways that play the remaining ones, too (simulated with episodes of 30 planners, results/settings.md)
 LATER = "train_planner() plays one later, and so does --resume with as many steps (-n) as the run had."
 
 
 class TrialStopped(KeyboardInterrupt):
-    """Raised where ``should_stop`` ends a trial, and not the user."""
+    """Raised where ``should_stop`` ends a trial, and not Ctrl-C."""
 
 
 @contextmanager
@@ -40,7 +40,7 @@ def stopped_alone() -> Iterator[None]:
         raise
     except KeyboardInterrupt:
         print(f"The trial was interrupted: the planner answers as it is. {LATER}")
-    except Exception as error:  # of any simulator: what was learned is not lost by it
+    except Exception as error:  # from any simulator; it must not lose what was learned
         warnings.warn(
             f"The trial has failed, and the planner answers as it is: {type(error).__name__}: {error} {LATER}",
             stacklevel=4,
@@ -52,14 +52,14 @@ class Trial:
     """What :func:`play_trial` measured."""
 
     returns: dict[str, np.ndarray]
-    """(n_episodes,) of each of ``planner_ways``, in their order; of "planner", in the place of the way that is its own
-    or behind them; and of "expert". Undiscounted, in the task's own rewards. Fewer of ways that were given up"""
+    """(n_episodes,) of each of ``planner_ways``, in their order; of "planner", after them or in place of the way that
+    has its settings; and of "expert". Undiscounted, in the task's own rewards. A way that was given up has fewer"""
     ages: np.ndarray
-    """(n_episodes,) age of an episode's observations once it has settled, in control steps. The largest for one that
-    ends before an action shows: that age's player begins every episode. 0 for all where it changes within some episode:
-    then no age belongs to an episode"""
+    """(n_episodes,) age of each episode's observations once it has settled, in control steps. An episode that ends
+    before an action shows has the largest age, since the one that answers there begins every episode. If the age
+    changes within some episode, no age belongs to an episode, and all are 0"""
     n_steps: int
-    """taken by all together, those of environments that wait for the others, too"""
+    """steps of all players together, with those of environments that wait for the others"""
 
 
 def play_trial(
@@ -72,19 +72,19 @@ def play_trial(
 ) -> Trial:
     """Play the training environment with the planner, in each of its ways, and with the expert, from the same seeds.
 
-    All of them play the first quarter of the episodes, in whole rounds of the environments. Then the three best ways,
-    each with the expert at the ages at which that does better, and the expert play on.
+    All of them play the first quarter of the episodes, in whole rounds of the environments. Then the three best ways
+    and the expert play on. The score of a way includes the expert, at the ages at which the expert does better.
 
-    These are environment steps beyond those of ``learn``. An expert that has not learned at age 0, as one of a fixed
-    delay, does not try to act on a guessed present.
+    The steps come on top of ``learn``'s. The actor does not play on a guessed present where the expert has not learned
+    at age 0, as with a fixed delay.
 
     :param model: with a trained planner and an environment; stays as it is
-    :param n_episodes: for each that plays to the end
+    :param n_episodes: of each player that plays to the end
     :param progress_bar: show one
     :param should_stop: asked after every step
-    :param planners: other trained planners, which ways of their masks play; ways whose mask none has are left out
-    :param make_env: makes environments like the training's, to play in several at once; without it, or where the
-        training has as many, its own play
+    :param planners: other trained planners, for the ways of their masks; ways whose mask no planner has are left out
+    :param make_env: makes environments like the training's, to play in several at once. Without it, or where the
+        training has as many, its own are used
     :raises TrialStopped: when ``should_stop`` has ended the trial
     """
     policy, seed = model.policy, int(np.random.randint(2**31))
@@ -109,12 +109,12 @@ def play_trial(
             returns[name] = np.append(returns[name], found)
             met.append(met_ages)
             n_steps += n_played
-        ages = np.append(ages, np.min(met, axis=0))  # whoever falls at once does not tell it
+        ages = np.append(ages, np.min(met, axis=0))  # a player that falls at once shows the largest age instead
 
     try:
         with _env_of(model, n_episodes, make_env) as env:
             n_first = n_episodes if len(ways) <= GO_ON else int(np.ceil(FIRST_PART * n_episodes))
-            # Environments, whose delays may differ, have their turns; else they would step on for those that play
+            # In whole rounds, as delays of environments may differ, and those without an episode would step on anyway
             n_first = min(n_episodes, int(np.ceil(n_first / env.num_envs)) * env.num_envs)
             play_on(env, [*everyone], n_first)
             if n_first < n_episodes:
@@ -128,7 +128,7 @@ def play_trial(
 
 @contextmanager
 def _env_of(model: PlannerAgent, n_episodes: int, make_env: MakeEnv | None) -> Iterator[VecEnv]:
-    """Hand out what a trial is played in: the training environment, or those that are made, and closed behind it."""
+    """Give the environments of a trial: the training's own, or new ones, which are closed after it."""
     n_envs = min(AT_ONCE, n_episodes)
     assert model.env is not None  # a trial is of an agent that has one
     made = None if make_env is None or model.env.num_envs >= n_envs else _made(model, make_env, n_envs)
@@ -143,12 +143,12 @@ def _env_of(model: PlannerAgent, n_episodes: int, make_env: MakeEnv | None) -> I
 
 
 def _made(model: PlannerAgent, make_env: MakeEnv, n_envs: int) -> VecEnv | None:
-    """Make environments that show what the training's do; where that fails, warn, and return none."""
+    """Make environments with the observations of the training's; where that fails, warn, and return None."""
     own, env = model.get_vec_normalize_env(), None
     try:
         env = make_env(n_envs)
         if model.env is not None and env.unwrapped is model.env.unwrapped:
-            return None  # which is not to be closed
+            return None  # the training's own, which stay open
         normalizer = unwrap_vec_normalize(env)
         if own is not None and normalizer is None:
             env = normalizer = VecNormalize(env, norm_obs=own.norm_obs, norm_obs_keys=own.norm_obs_keys)
@@ -158,7 +158,7 @@ def _made(model: PlannerAgent, make_env: MakeEnv, n_envs: int) -> VecEnv | None:
             normalizer.clip_obs, normalizer.epsilon = own.clip_obs, own.epsilon
             normalizer.training = normalizer.norm_reward = False
         return env
-    except Exception as error:  # of any simulator: what was learned is not lost by it
+    except Exception as error:  # from any simulator; it must not lose what was learned
         warnings.warn(
             f"The trial is played in the training's own environment: {type(error).__name__}: {error}", stacklevel=6
         )
@@ -168,15 +168,15 @@ def _made(model: PlannerAgent, make_env: MakeEnv, n_envs: int) -> VecEnv | None:
 
 
 def _close(env: VecEnv) -> None:
-    """Close environments that were made; an error of theirs, as of processes that have ended, loses no trial."""
+    """Close environments that were made; their errors, as of processes that have ended, must not lose the trial."""
     try:
         env.close()
-    except Exception as error:  # of any simulator
+    except Exception as error:  # from any simulator
         warnings.warn(f"The trial's environments could not be closed: {type(error).__name__}: {error}", stacklevel=6)
 
 
 def _if_settled(ages: np.ndarray) -> np.ndarray:
-    """Return episodes' ages, or 0 for all where one changed within an episode, which is NaN here."""
+    """Return episodes' ages; or 0 for all where one is NaN, that is, changed within an episode."""
     return np.zeros(len(ages)) if np.isnan(ages).any() else ages
 
 
@@ -193,12 +193,13 @@ def _play(
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Return the returns and ages of the episodes from the resets seed, seed + 1, ..., and the steps taken.
 
-    Each environment plays one at a time and waits for the longest. The age of an episode is NaN where it changes.
+    In each round every environment plays one episode and waits for the longest. An age that changes within its episode
+    is NaN.
     """
     returns, settled_ages, n_steps = np.zeros(n_episodes), np.zeros(n_episodes), 0
     longest = CUT_AT * (int(model.replay_buffer.steps.max()) + 1)
     for first in range(0, n_episodes, env.num_envs):
-        env.seed(seed + first)  # of each environment one more than of that before it
+        env.seed(seed + first)  # each environment gets one more than the one before it
         obs, ages = cast(Any, env.reset()), []
         sums = np.zeros(env.num_envs)
         is_played = first + np.arange(env.num_envs) < n_episodes
@@ -238,7 +239,7 @@ def best_share(planner: np.ndarray, expert: np.ndarray, ages: np.ndarray) -> tup
 
 
 def gains_more_than_its_error(returns: np.ndarray, than: np.ndarray) -> bool:
-    """Tell whether returns (n,) are better than others of the same episodes by more than one standard error of that.
+    """Tell whether returns (n,) are better than others of the same episodes by more than the gain's standard error.
 
     Of many shares some look better by chance. One error is a low bar: where ten episodes of two equal players are
     compared, a share passes in a fifth of the cases, and loses nothing.
@@ -251,8 +252,8 @@ def gains_more_than_its_error(returns: np.ndarray, than: np.ndarray) -> bool:
 def best_answer(trial: Trial) -> tuple[str, float, bool]:
     """Return the way to decide that did best, the age that parts planner and expert, and whether the expert is below.
 
-    If the best way gains no more than its error over some, the first of these is taken. Both answer only if that
-    :func:`gains_more_than_its_error` over the better of the two.
+    If the best way gains no more than the error over some ways, the first of these is taken. Planner and expert both
+    answer only if together they gain more than the error over the better one alone.
 
     :return: the age is -1 where the planner alone answers, and infinite where the expert does
     """
@@ -281,7 +282,7 @@ def let_the_best_answer(
 ) -> dict[str, float | str]:
     """Let the planner in its best way answer, or the expert, or both, each at the ages at which it does better.
 
-    Who that is, :func:`best_answer` says. Warn where the expert alone answers.
+    :func:`best_answer` chooses. Warn where the expert alone answers.
 
     :param planners: beside the agent's own, as of :func:`play_trial`; the agent takes the one of the best way
     :param make_env: as of :func:`play_trial`
@@ -304,6 +305,6 @@ def let_the_best_answer(
             stacklevel=3,
         )
     means = {f"trial/{name}_return": float(returns.mean()) for name, returns in trial.returns.items()}
-    ages = model.policy.expert_ages  # up to -1 for none
+    ages = model.policy.expert_ages  # none: from 0 up to -1
     share = {"trial/expert_from": float(ages.start), "trial/expert_up_to": float(ages.stop - 1)}
     return {"trial/way": way, **means, **share, "trial/steps": float(trial.n_steps)}

@@ -1,4 +1,4 @@
-"""The ways to decide that a planner is tried in after its training."""
+"""The ways to decide in which a planner is tried after its training."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ from sb3_said.planner.config import SAMPLING_SETTINGS, PlannerConfig
 from sb3_said.sac.policies import settings_of
 from sb3_said.said.agent import PlannerAgent
 
-NAME_LENGTH = 25  # of a way; SB3's log takes longer ones that begin alike for the same
+NAME_LENGTH = 25  # of a way; SB3's log takes longer names that begin alike for the same
 
 DEFAULT_WAY: dict[str, Any] = {
     "decided_by": "plan",
     "temperature": 0.0,
     "sampling_steps": PlannerConfig.sampling_steps,
 }
-#: What a trial compares with an agent's own settings: the mean of all candidates, weighed by the critics; the expert's
-#: actor on the present that the planner's first guess has; the default's steps; a single step; and the default's steps
-#: where the present is inpainted with the plan, for a guess may go wrong at old observations. Which is best
-#: depends on task, delay and budget (measured, results/what_diffusion_buys.md and results/settings.md). Where the trial
-#: cannot tell, the order does: the first was best or second with each of seven planners. "own_ages" is another planner,
-#: of decisions made at the age that it is shown: where an expert does one thing on new observations and another on old
-#: ones, the first learns the mean of both (results/own_mask.md has where that gains, and where it loses).
+#: What a trial compares with an agent's own settings. "weighed": the mean of all candidates, weighed by the critics.
+#: "actor": the expert's actor on the guessed present. "default": the plan in the default's steps. "one_step": in one.
+#: "inpainted": the present is inpainted with the plan, since a guess may go wrong at old observations. "own_ages":
+#: another planner, of decisions made at the age that it is shown. Where an expert does one thing on new observations
+#: and another on old ones, the agent's own planner learns the mean of both (results/own_mask.md has where "own_ages"
+#: gains, and where it loses). Which way is best depends on task, delay and budget (measured,
+#: results/what_diffusion_buys.md and results/settings.md). Where the trial cannot tell, the first way is taken:
+#: "weighed" was best or second with each of seven planners.
 WAYS: dict[str, dict[str, Any]] = {
     "weighed": {"decided_by": "plan", "temperature": 1.0, "sampling_steps": 2, "choice_factor": 1.0},
     "actor": {"decided_by": "actor"},
@@ -71,9 +72,9 @@ def ways_of(
 
 
 def _on_the_first(ways: dict[str, dict[str, Any]], own: PlannerConfig) -> dict[str, dict[str, Any]]:
-    """Let ways be of the agent's first planner, but for those that say otherwise, also once it has the second's.
+    """Write mask and present of the agent's own planner into ways, lest they change once it has the second planner.
 
-    Its present stands where the rest of a way does not contradict it.
+    A way's own mask and present stand, and no present is written that contradicts the way.
     """
     return {name: {"mask": own.mask, **way, "present": in_way(own, way).present} for name, way in ways.items()}
 
@@ -81,20 +82,21 @@ def _on_the_first(ways: dict[str, dict[str, Any]], own: PlannerConfig) -> dict[s
 def in_way(own: PlannerConfig, settings: dict[str, Any]) -> PlannerConfig:
     """Return a planner's settings changed to a way to decide.
 
-    Where ``decided_by`` and ``present`` contradict each other, the way's own stands, and the other is the default's.
+    If ``decided_by`` and ``present`` contradict each other, the one that the way has stands; the other is the default.
 
     :raises ValueError: for values outside their range, or that this planner cannot have
     """
     try:
         return replace(own, **settings)
-    except ValueError:  # such as of the actor, where the agent inpaints the present now
+    except ValueError:  # such as for the actor, where the agent inpaints the present now
         return replace(own, **{"decided_by": "plan", "present": PlannerConfig.present, **settings})
 
 
 def untried(config: PlannerConfig, ways: Collection[dict[str, Any]]) -> PlannerConfig:
-    """Return a planner's settings as they are before a trial has chosen among ways: the default's, where it has one's.
+    """Return a planner's settings as they were before a trial chose one of the ways.
 
-    Settings that no way names stay, and all that are the user's own.
+    If they are a way's, all settings that ways name get their defaults. Else they are the user's own, and stay.
+    ``mask="own"`` gets its default in both cases.
     """
     mask = PlannerConfig.mask if config.mask == "own" else config.mask
     is_a_way = any(config == in_way(config, way) for way in ways)
@@ -108,10 +110,10 @@ def _configs(model: PlannerAgent) -> dict[str, PlannerConfig]:
 
 
 def masks_of(model: PlannerAgent) -> list[str]:
-    """Return the masks that the agent's ways to decide need a planner of, its planner's own first.
+    """Return the masks for which the agent's ways to decide need a planner, that of its own planner first.
 
-    Where not every age of 0..D was trained on, or none is known, as of logs, there are no decisions of each age to
-    learn from: a planner of ``mask="own"`` would serve some delays alone.
+    Where not every age of 0..D was trained on, or ages are not known, as in logs, ``"own"`` is left out: without
+    decisions at each age such a planner would serve some delays alone.
     """
     own, max_delay = model.policy.planner.config.mask, model.policy.max_delay
     knows_ages = max_delay > 0 and set(range(max_delay + 1)) <= set(model.trained_ages or [])
@@ -126,9 +128,9 @@ def masks_of(model: PlannerAgent) -> list[str]:
 def players_of(
     model: PlannerAgent, planners: Sequence[InpaintingPlanner]
 ) -> dict[str, tuple[InpaintingPlanner, PlannerConfig]]:
-    """Return who decides in each of the agent's ways that one of these planners, or its own, can play, and how.
+    """Return a planner and its settings for each of the agent's ways that these planners, or its own, can play.
 
-    Without delay the present is seen, so that a way that inpaints it is left out beside one that does not.
+    Without delay the present is seen. So a way that inpaints it is left out where another differs in that alone.
     """
     by_mask = {planner.config.mask: planner for planner in (*planners, model.policy.planner)}
     configs = {name: way for name, way in _configs(model).items() if way.mask in by_mask}

@@ -1,4 +1,4 @@
-"""What a run plays beside its training: evaluations while it learns, and of the agent as it answers in the end."""
+"""What a run plays beside its training: evaluations while it learns, and one of the trained agent as it answers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sb3_said.files.normalization import normalization_file, save_normalization
 from sb3_said.zoo.stopping import Stopping
 
 BEST_NAME = "best_model.zip"  # of the agent that did best in training, as SB3's EvalCallback names it
-EXPERT_FOLDER = "expert"  # in the run's: what EvalCallback wrote while the expert learned
+EXPERT_FOLDER = "expert"  # in the run's folder: what EvalCallback wrote while the expert learned
 
 
 class _BrokenOff(Exception):
@@ -28,9 +28,9 @@ class _BrokenOff(Exception):
 
 
 class StoppableEvaluation(EvalCallback):
-    """SB3's, which breaks off where the training is asked to stop.
+    """SB3's ``EvalCallback``. An evaluation breaks off when the training is asked to stop.
 
-    A resume plays it in its first step, and those that follow one step later, too.
+    A resumed training plays it again in its first step. All later evaluations then come one step later, too.
 
     :param stopping: says whether the training is asked to stop
     """
@@ -43,7 +43,7 @@ class StoppableEvaluation(EvalCallback):
         try:
             return super()._on_step()
         except _BrokenOff:
-            self.n_calls -= 1  # so that the next call is the one that plays
+            self.n_calls -= 1  # so that the next call plays it again
             return True
 
     def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
@@ -64,8 +64,8 @@ def evaluate_answer(model: SAID, like: EvalCallback, folder: Path, stopping: Sto
     Beside SB3's arrays, ``answers`` says who answered. The first row, of step 0, holds NaN: there was no planner yet,
     and rl_zoo3's plots need two rows. ``best_model.zip`` is the agent of the row with the highest mean.
 
-    :param like: whose environment and number of episodes are taken
-    :param stopping: ends it with a ``KeyboardInterrupt``
+    :param like: callback that gives the environment and the number of episodes
+    :param stopping: ends the evaluation with a ``KeyboardInterrupt``
     """
     if model.get_vec_normalize_env() is not None:
         sync_envs_normalization(model.env, like.eval_env)  # type: ignore[arg-type]  # a trained agent has one
@@ -75,7 +75,7 @@ def evaluate_answer(model: SAID, like: EvalCallback, folder: Path, stopping: Sto
             raise KeyboardInterrupt
         _warn_if_long(locals_)
 
-    like.eval_env.seed(model.seed)  # a run that goes on after a stop plays the episodes of one that was not stopped
+    like.eval_env.seed(model.seed)  # so a resumed run plays the same episodes as one never stopped
     played: Any = evaluate_policy(
         model, like.eval_env, like.n_eval_episodes, like.deterministic, callback=on_step, return_episode_rewards=True
     )
@@ -83,7 +83,7 @@ def evaluate_answer(model: SAID, like: EvalCallback, folder: Path, stopping: Sto
     path, now, who = folder / "evaluations.npz", model.num_timesteps, model.policy.who_answers
     rows: dict[int, Sequence[Any]] = {0: ([np.nan] * len(returns), [0] * len(returns), "")}
     if path.exists():
-        # An evaluation of as many episodes alone can stand in one array with this.
+        # One array can only hold evaluations of equally many episodes.
         rows |= {t: row for t, *row in _rows_before(path) if 0 < t < now and len(row[0]) == len(returns)}
     best = max((np.mean(row[0]) for step, row in rows.items() if step > 0), default=-np.inf)
     rows[now] = (returns, lengths, who)
@@ -101,7 +101,7 @@ def evaluate_answer(model: SAID, like: EvalCallback, folder: Path, stopping: Sto
 
 
 def _rows_before(path: Path) -> list[tuple[Any, ...]]:
-    """Return the rows of a file of evaluations, and none, with a warning, of one that is damaged: step, returns, ..."""
+    """Return the rows of a file of evaluations: step, returns, ...; none of a damaged file, with a warning."""
     try:
         with np.load(path) as file:
             columns = [file[name].tolist() for name in ("timesteps", "results", "ep_lengths", "answers")]
@@ -112,7 +112,7 @@ def _rows_before(path: Path) -> list[tuple[Any, ...]]:
 
 
 def save_with_normalization(model: DelayedSAC, path: Path) -> None:
-    """Write an agent, and beside it the normalisation that it reads its observations in."""
+    """Write an agent, and beside it the statistics that normalise its observations."""
     model.save(path)
     vec_normalize = model.get_vec_normalize_env()
     if vec_normalize is not None:

@@ -40,7 +40,7 @@ def add_delay(parser: argparse.ArgumentParser, default: str, name: str = "--dela
 
 
 def add_playing(parser: argparse.ArgumentParser, episodes: int | None, seed: int = 10_000) -> None:
-    """Give a command line the options of how trained agents play; without a number of episodes, no option of it."""
+    """Give a command line the options of how trained agents play; ``--episodes`` only where it has a default."""
     parser.add_argument("--algo", help="algorithm of a .zip without its run folder")
     parser.add_argument("--env", help="task to play (default: the trained one)")
     if episodes is not None:
@@ -77,7 +77,7 @@ def device(word: str) -> str:
     try:
         if word != "auto":
             th.zeros(1, device=word)
-    except (RuntimeError, AssertionError, ImportError) as error:  # as each backend says it
+    except (RuntimeError, AssertionError, ImportError) as error:  # each backend raises its own
         told = str(error).partition("\n")[0]
         raise argparse.ArgumentTypeError(f"auto, cpu, cuda or another that torch has, got {word}: {told}") from error
     return word
@@ -97,7 +97,7 @@ def check_positive(args: argparse.Namespace, *names: str) -> None:
 def explained(parser: argparse.ArgumentParser, goes_on: bool = False) -> Iterator[None]:
     """Turn errors that a user can mend into a message without a traceback.
 
-    :param goes_on: where it was interrupted, when the same command is given again
+    :param goes_on: whether the same command, given again, goes on where it was interrupted
     """
     try:
         yield
@@ -130,7 +130,7 @@ CODE_ERRORS = (ArithmeticError, AttributeError, LookupError, NameError, RuntimeE
 @contextmanager
 def reading_settings() -> Iterator[None]:
     """
-    :raises ValueError: for a setting whose code fails, or names what there is not
+    :raises ValueError: for a setting whose code fails, or names something that does not exist
     """
     try:
         yield
@@ -154,11 +154,11 @@ def read_delay(words: list[str]) -> Delay:
 
 
 def largest_delay(delay: Delay) -> int:
-    """Return the largest age that a delay can bring, 0 without one."""
+    """Return the largest age that a delay can bring, 0 without a delay."""
     return 0 if delay is None else make_process(delay).max_delay
 
 
 def ages_under(delay: Delay) -> list[int]:
-    """Return the ages that a delay can bring amid an episode, [0] without one."""
+    """Return the ages that a delay can bring after the start of an episode, [0] without a delay."""
     low, high = age_range(0 if delay is None else delay)
     return [*range(low, high + 1)]

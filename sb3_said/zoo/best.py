@@ -1,4 +1,4 @@
-"""Write what a search found: a best.yml to train with, and beside best.zip what makes its task."""
+"""Write what a search found: best.yml to train with, and beside best.zip the files that make its task."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ def write_best(run: Path, folder: Path, planner: dict[str, Any], n_updates: int,
 
     :param run: folder of the run that was tuned
     :param folder: to write to
-    :param planner: its settings that the trials had beside the run's arguments
-    :param n_updates: that the planner was trained for
-    :param choice: how they were chosen, for a comment
+    :param planner: settings of the best trial's planner, which replace those of the run
+    :param n_updates: updates that the planner was trained for
+    :param choice: says how the settings were chosen, for a comment
     """
     record = Record.read(run)
     hyperparams = {
@@ -37,10 +37,10 @@ def write_best(run: Path, folder: Path, planner: dict[str, Any], n_updates: int,
         hyperparams["planner_gradient_steps"] = n_updates
     record = replace(record, hyperparams=hyperparams, options=options)
     if (statistics := normalization_file(run / record.agent_name)).exists():
-        shutil.copyfile(statistics, normalization_file(folder / record.agent_name))  # of all agents there
+        shutil.copyfile(statistics, normalization_file(folder / record.agent_name))  # serves all agents there
 
     words = ["sb3-said", "train", "--algo", "said", *record.task_words(), *record.agent_words()]
-    if record.eval_env_kwargs != record.env_kwargs:  # which the YAML has
+    if record.eval_env_kwargs != record.env_kwargs:  # the YAML has only env_kwargs
         words += ["--eval-env-kwargs", *(f"{name}:{value!r}" for name, value in record.eval_env_kwargs.items())]
     command = shlex.join([*words, "-conf", str(folder / TUNED_SETTINGS)])
 
@@ -49,14 +49,14 @@ def write_best(run: Path, folder: Path, planner: dict[str, Any], n_updates: int,
     lines += [f"Left out, as YAML cannot hold it: {name}" for name in left_out]
     text = "".join(f"# {line}\n" for line in lines) + yaml.safe_dump({record.env: block}, sort_keys=False)
     write_text(folder / TUNED_SETTINGS, text)
-    record.write(folder)  # what makes the task of best.zip; last, as without the YAML it is that of a run
+    record.write(folder)  # makes the task of best.zip; last, as without the YAML the folder looks like a run's
     return command
 
 
 def plain_settings(record: Record) -> tuple[dict[str, Any], list[str]]:
     """Return hyper-parameters as rl_zoo3 reads them from YAML, and the names of those that YAML cannot hold.
 
-    :param record: of a run, whose settings beside the hyper-parameters are taken in
+    :param record: of a run; its ``env_kwargs`` and ``n_timesteps`` are taken in, too
     """
     given = {name: value for name, value in record.hyperparams.items() if name != "env_wrapper" or value}
     given |= {"env_kwargs": record.env_kwargs} if record.env_kwargs else {}

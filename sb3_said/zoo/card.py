@@ -38,7 +38,7 @@ examples:
 The returns must be of this very file: one that was measured before the file was written anew is refused.
 """
 
-CARD_BEGINS = b"---\n"  # as the YAML of every card on the Hub
+CARD_BEGINS = b"---\n"  # every card on the Hub begins with YAML
 TEMPLATE = """\
 ---
 {{ card_data }}
@@ -75,9 +75,9 @@ def main(argv: list[str] | None = None) -> None:
 
 
 def trial_steps(folder: Path) -> int:
-    """Return the environment steps that a run's trials took beyond those of ``learn``, as its logs have them.
+    """Return the environment steps of a run's trials, which ``learn`` does not count.
 
-    There is a log for each resume.
+    They are in the run's logs. Each resume has a log of its own.
     """
     steps = 0
     for file in folder.glob("progress*.csv"):
@@ -91,11 +91,11 @@ def make_card(
 ) -> ModelCard:
     """Return the card of an agent.
 
-    :param run: the agent's file
+    :param run: the agent, opened from its file
     :param record: of the run that made it
     :param results: of ``over-delays``, with cells of this file
     :param latency_ms: median time of a decision
-    :param n_trial_steps: environment steps that told how the planner decides, beyond those of the training
+    :param n_trial_steps: environment steps of the trials, beyond those of the training
     :raises ValueError: when the results hold nothing of this file, or are of another task than its training
     """
     made = {"seed": (record.seed, run.model.seed), "env": (record.env, getattr(run.model, "task", None) or record.env)}
@@ -110,7 +110,7 @@ def make_card(
     file = Path(run.info["file"])
     digest = digest_of(run)
     known = [cell for cell in results.cells if cell.sha256 == digest and cell.result is not None]
-    cells = [*{cell.key: cell for cell in known}.values()]  # each once, whatever the file was labelled
+    cells = [*{cell.key: cell for cell in known}.values()]  # each once, though the file may have several labels
     who = run.model.policy.who_answers if hasattr(run.model.policy, "who_answers") else None
     answered = [cell for cell in cells if cell.answer == who and not cell.age_error]
     if not answered:
@@ -220,7 +220,7 @@ def use(run: LoadedRun) -> list[str]:
 
 
 def ages_trained_on(run: LoadedRun, record: Record) -> list[int]:
-    """Return the ages that an agent has met; a planner has drawn them all, where its expert or logs had others."""
+    """Return the ages that an agent was trained on: all, for a planner from logs or from an expert of another delay."""
     if isinstance(run.model, SAID) and (record.dataset or record.expert_delay is not None):
         return [*range(run.model.policy.max_delay + 1)]
     return run.model.trained_ages or []  # type: ignore[attr-defined]  # all of ours have them
@@ -252,7 +252,7 @@ def who_answers(model: Any) -> str:
 def made_by(record: Record, model: Any = None) -> str:
     """Return the command that trains such an agent, with the settings that are not the preset's.
 
-    :param model: the agent, which has the settings that the preset got since, and those of its planner
+    :param model: the agent; it holds settings that the preset has gained since, and those of its planner
     """
     file = config_file(record.algo, bool(record.dataset))
     blocks = yaml.safe_load(file.read_text())
@@ -260,14 +260,15 @@ def made_by(record: Record, model: Any = None) -> str:
     usual |= preset_overrides(file, record.preset, record.env, record.delay, dataset=record.dataset)
     steps = record.options.get("n_timesteps") or -1
     if steps < 0 and record.hyperparams.get("n_timesteps") not in (None, usual["n_timesteps"]):
-        steps = int(record.hyperparams["n_timesteps"])  # rl_zoo3's -1 leaves it to the YAML, or to -params
+        steps = int(record.hyperparams["n_timesteps"])  # rl_zoo3's -1 takes the steps from the YAML, or from -params
     budget = ["-n", str(steps)] if steps > 0 else []
     newer = usual.keys() - record.hyperparams.keys() - {"policy", "planner_kwargs"}
     had = {name: getattr(model, name) for name in sorted(newer) if hasattr(model, name)} | record.hyperparams
     given = had.get("planner_kwargs") or {}
     if isinstance(model, SAID) and isinstance(given, dict):
         asked, has = PlannerConfig(**given).weight_settings(), model.policy.planner.config.weight_settings()
-        older = {name: value for name, value in has.items() if value != asked[name] and name != "mask"}  # of the trial
+        # The mask is left out: the trial chooses it
+        older = {name: value for name, value in has.items() if value != asked[name] and name != "mask"}
         had |= {"planner_kwargs": given | older} if older else {}
     own = {name: value for name, value in had.items() if value != usual.get(name) and name != "n_timesteps"}
     words = ["sb3-said", "train", "--algo", record.algo, *record.task_words(), "--preset", record.preset, *budget]
@@ -282,7 +283,7 @@ def made_by(record: Record, model: Any = None) -> str:
 
 
 def as_word(name: str, value: Any) -> str | None:
-    """Write a setting as a command line takes it: Python, or text of Python with rl_zoo3's names; None if neither."""
+    """Write a setting for a command line: as Python, or as text of Python with rl_zoo3's names; else return None."""
     try:
         ast.literal_eval(repr(value))
         return repr(value)

@@ -15,7 +15,7 @@ from filelock import FileLock
 from sb3_said.delays.text import make_process
 from sb3_said.files.atomic import write_json
 
-AGE = ", age "  # in the name of a column, before the error
+AGE = ", age "  # stands before the age error in the name of a column
 
 
 @dataclass
@@ -29,46 +29,46 @@ class Cell:
     """control steps, or a process as it was written"""
     algo: str
     file: str
-    """its path: absolute where the command line has it so, else from the working directory, and from the results'
-    folder within their file"""
+    """the agent's file: absolute if the command line gave it so. Otherwise the path starts at the working directory;
+    written to the JSON file, it starts at that file's folder"""
     sha256: str
-    """of the file, and of what else decides what it sees: what its run changes in the task but the delay, and the
-    statistics of ``VecNormalize``, if anything"""
+    """of the file and of all else that decides what the agent sees: what its run changes in the task besides the
+    delay, and the statistics of ``VecNormalize``, if any"""
     trained_steps: int
     obstacle: str | None
     """why the agent cannot play this delay"""
     origin: int | None = None
     """which of the file's origins made the result"""
     result: dict[str, Any] | None = None
-    """a summary without its label, which the cell has"""
+    """a summary without its label: the cell has that"""
     age_error: int = 0
-    """control steps that the age is told wrong by, cut at 0 and at the largest that the agent was built for"""
+    """control steps by which the age is told wrong; the told age is cut at 0 and at the agent's largest"""
     is_changed: bool = False
-    """whether its run changes the task, so that no reference return is of it"""
+    """whether its run changes the task; no reference return holds for a changed task"""
 
     @property
     def key(self) -> tuple[str, ...]:
-        """The file's contents, the answer, the delay and the error: equal keys have equal results, but for rounding,
-        which depends on how many episodes are played side by side."""
+        """The file's contents, the answer, the delay and the age error. Cells of equal keys have equal results. Only
+        rounding depends on how many episodes are played side by side."""
         return self.sha256, str(self.answer), repr(make_process(self.delay)), str(self.age_error)
 
     @property
     def lineage(self) -> tuple[str, str]:
-        """The file and the label: an agent of both, but of other contents, is an earlier state of this one."""
+        """The file and the label. A cell with equal ones but another ``sha256`` is of an earlier state of the agent."""
         return os.path.abspath(self.file), self.agent.removesuffix(f" {self.answer}")
 
     @property
     def column(self) -> int | str:
-        """What the table shows it under: its delay, and how wrong the age is told."""
+        """The cell's column in the table: its delay, and how wrong the age is told."""
         return f"{self.delay}{AGE}{self.age_error:+d}" if self.age_error else self.delay
 
 
 class Results:
     """The cells of a JSON file, which is always written whole. Several processes may add to one file at a time.
 
-    :param path: of the file; new where there is none
+    :param path: of the file, which need not exist yet
     :param settings: what all cells have in common; those of the file by default
-    :raises ValueError: for a file of another kind or with other settings, and for none without settings
+    :raises ValueError: for a file of another kind or with other settings, and for neither file nor settings
     """
 
     def __init__(self, path: Path, settings: dict[str, Any] | None = None):
@@ -83,9 +83,9 @@ class Results:
             raise ValueError(f"{path} holds {found}, but {settings} is to be played: give another --json.")
 
     def ask(self, cells: list[Cell]) -> list[Cell]:
-        """Put these cells first and fill in what is known under any label; drop cells of agents whose file has changed.
+        """Put these cells first, and fill in results known under any label. Drop cells of agents whose file changed.
 
-        :return: those dropped
+        :return: the dropped cells
         """
         known = {cell.key: cell for cell in self.cells if cell.result is not None}
         for cell in cells:
@@ -102,12 +102,12 @@ class Results:
         return [cell for cell in others if has_changed(cell)]
 
     def add(self, cell: Cell, result: dict[str, Any], origin: dict[str, Any]) -> None:
-        """Give one of the cells asked for its result, and write the file.
+        """Store the result of a cell that was asked for, and write the file.
 
         :param origin: command, date, machine and versions
         """
         with self._newest():
-            if self._own is None:  # each process has one, and none is ever removed
+            if self._own is None:  # each process adds one; none is ever removed, so its number stays
                 self._own = len(self.origins)
                 self.origins.append(origin)
             cell.origin, cell.result = self._own, result
@@ -119,7 +119,7 @@ class Results:
 
     @contextmanager
     def _newest(self) -> Iterator[None]:
-        """Take in what other processes have added since, and write the file after the context, before they do again."""
+        """Take in what other processes have added, and write the file after the context. Until then they wait."""
         with FileLock(self.path.with_name(f".{self.path.name}.lock")):
             if self.path.exists():
                 newest = Results(self.path, self.settings)
@@ -144,5 +144,5 @@ def _read(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]], list[Cell]]
 
 
 def _moved(path: str, to: Path, within: Path = Path()) -> str:
-    """Return a path of one folder as it is from another; absolute ones stay."""
+    """Return a path relative to one folder as it is from another; an absolute path stays."""
     return path if os.path.isabs(path) else os.path.relpath(within / path, to)

@@ -38,7 +38,7 @@ def main() -> None:
     sys.argv = [f"sb3-said {name}", *rest]
     try:
         command = importlib.import_module(f"sb3_said.zoo.{name.replace('-', '_')}")
-    except KeyboardInterrupt:  # it takes seconds
+    except KeyboardInterrupt:  # the import takes seconds
         print("\nInterrupted.", file=sys.stderr)
         sys.exit(130)
     except ModuleNotFoundError as error:

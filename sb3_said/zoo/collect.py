@@ -69,7 +69,7 @@ from reset seed --seed + i, by default where neither training nor evaluation nor
 
 @dataclass
 class Episode:
-    """What one episode was, as the task itself saw it."""
+    """One episode, as the task itself saw it."""
 
     states: list[np.ndarray]
     """s_0 and the state after each step"""
@@ -80,17 +80,19 @@ class Episode:
     seed: int = 0
     """of its reset"""
     is_whole: bool = False
-    """it has ended, and was not cut off"""
+    """whether it has ended, and was not cut off"""
 
     def cut(self, n_steps: int) -> Episode:
-        """Return the first steps of it."""
+        """Return its first steps."""
         is_whole = self.is_whole and n_steps >= len(self.rewards)
         kept = self.states[: n_steps + 1], self.actions[:n_steps], self.rewards[:n_steps]
         return Episode(*kept, self.terminated and is_whole, self.seed, is_whole)
 
 
 class Recorder(gym.Wrapper[Any, Any, Any, Any]):
-    """Adds each episode to a list when it begins, so in the order of seeds, with the true states of a delayed task.
+    """Adds each episode to a list, with the true states of a delayed task.
+
+    An episode is added when it begins, so the list is in the order of seeds.
 
     :param on_step: called after each step
     """
@@ -108,7 +110,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(action)
         is_delayed = isinstance(observation, dict)
-        assert isinstance(self.action_space, gym.spaces.Box)  # as check_spaces says
+        assert isinstance(self.action_space, gym.spaces.Box)  # check_spaces has seen to it
         executed = info[EXECUTED] if is_delayed and EXECUTED in info else scale_action(action, self.action_space)
         self.episode.states.append(true_state(observation, info))
         self.episode.actions.append(np.asarray(executed, np.float32))
@@ -135,13 +137,13 @@ class NoisyAgent:
 
     def __init__(self, model: Any, space: gym.spaces.Box, noise: float, seed: int):
         self.model, self.space, self.noise = model, space, noise
-        self.policy = getattr(model, "policy", None)  # by which a recurrent agent is known
+        self.policy = getattr(model, "policy", None)  # it tells a recurrent agent
         self.rng = np.random.default_rng([seed, NOISE_STREAM])
 
     def predict(self, observation: Any, state: Any = None, **how: Any) -> tuple[np.ndarray, Any]:
         if self.model is None:
             n = len(next(iter(observation.values())) if isinstance(observation, dict) else observation)
-            if holds_whole_numbers(self.space):  # rounded, each bound would have half of its share
+            if holds_whole_numbers(self.space):  # rounding would give each bound half of its share
                 low, high, dtype = cast(Any, (self.space.low, self.space.high, self.space.dtype))
                 return self.rng.integers(low, high, (n, *self.space.shape), dtype, endpoint=True), None
             return unscale_action(self.rng.uniform(-1.0, 1.0, (n, *self.space.shape)), self.space), None
@@ -151,7 +153,7 @@ class NoisyAgent:
 
 
 class ShareIsFull(Exception):
-    """Ends a play before its episodes end, which some never do."""
+    """Ends a play before its episodes end: some never do."""
 
 
 @dataclass(frozen=True)
@@ -160,7 +162,7 @@ class Share:
 
     name: str
     run: LoadedRun
-    """whose model may be None, for random actions"""
+    """its model is None for random actions"""
     noise: float
 
 
@@ -193,7 +195,7 @@ def main(argv: list[str] | None = None) -> None:
             for i, share in enumerate(shares):
                 n_steps = args.steps * (i + 1) // len(shares) - args.steps * i // len(shares)
                 who = os.path.abspath(share.name), share.noise  # a path may be given in two ways
-                first = unused.get(who, args.seed)  # else the same steps came again
+                first = unused.get(who, args.seed)  # otherwise the same steps would come again
                 parts.append(play(share, n_steps, first, args.n_envs, not args.stochastic, bar))
                 unused[who] = 1 + max(episode.seed for episode in parts[-1])
         run = shares[0].run
@@ -211,8 +213,8 @@ def main(argv: list[str] | None = None) -> None:
 def open_agents(args: argparse.Namespace) -> Iterator[Share]:
     """Open each agent, at each noise level.
 
-    :raises ValueError: for what cannot be opened, agents of several tasks, random actions alone of no task, or a task
-        with other spaces
+    :raises ValueError: for what cannot be opened, agents of several tasks, random actions without a task, or a task
+        whose spaces do not fit
     :raises gymnasium.error.Error: for a task that is not registered
     """
     import_packages(args.gym_packages)
@@ -249,7 +251,8 @@ def open_agent(name: str, args: argparse.Namespace) -> LoadedRun:
     if not (path.is_file() and zipfile.is_zipfile(path) and "policy.pth" in zipfile.ZipFile(path).namelist()):
         played = {"algo": args.algo, "env_id": args.env, "delay": read_delay(args.delay), "device": args.device}
         run = load_run(path, gym_packages=args.gym_packages, **played)
-        changes = {name: given for name, given in run.changes.items() if name != "action_delay"}  # no log shows it
+        # A log holds executed actions, so it does not show an action delay
+        changes = {name: given for name, given in run.changes.items() if name != "action_delay"}
         return replace(run, changes=changes)
     if args.env is None or args.algo not in ALGOS:
         raise ValueError(f"{path} is of Stable-Baselines3: name its task with --env and its class with --algo.")
@@ -261,7 +264,7 @@ def open_agent(name: str, args: argparse.Namespace) -> LoadedRun:
 
 
 def normalization_beside(path: Path, env_id: str) -> Callable[[Any], Any] | None:
-    """Return VecNormalize's normalisation of observations where an agent of Stable-Baselines3 has one, and print it.
+    """Return how VecNormalize normalises an SB3 agent's observations, None where it does not. Print which it is.
 
     :param path: of the agent; ``vecnormalize.pkl`` lies beside it, or in the folder that is named after the task
     :raises ValueError: for a file that cannot be opened, or is of another task
@@ -284,7 +287,7 @@ def normalization_beside(path: Path, env_id: str) -> Callable[[Any], Any] | None
 
 
 def play(share: Share, n_steps: int, seed: int, n_envs: int, deterministic: bool, bar: tqdm[Any]) -> list[Episode]:
-    """Play episodes until there are so many steps; the last one is cut off.
+    """Play episodes until there are ``n_steps`` steps, and cut off the last episode.
 
     :param bar: moves on with the steps
     """
@@ -293,8 +296,8 @@ def play(share: Share, n_steps: int, seed: int, n_envs: int, deterministic: bool
     used, left, n_taken = 0, n_steps, 0
 
     def on_step() -> None:
-        nonlocal n_taken  # a bar that is not shown counts nothing
-        if n_taken < n_steps:  # steps of the last episodes are cut off
+        nonlocal n_taken  # the bar counts nothing while it is not shown
+        if n_taken < n_steps:  # the steps beyond are cut off
             n_taken += 1
             bar.update()
         if n_taken == n_steps and n_settled(episodes) >= left:
@@ -323,7 +326,7 @@ def play(share: Share, n_steps: int, seed: int, n_envs: int, deterministic: bool
 
 
 def n_settled(episodes: list[Episode]) -> int:
-    """Return the number of steps that will be kept whatever comes: in the order they began, up to who still plays."""
+    """Return how many steps are sure to be kept: those of all episodes up to the first that still plays, inclusive."""
     n_steps = 0
     for episode in episodes:
         n_steps += len(episode.rewards)

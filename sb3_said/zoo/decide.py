@@ -119,9 +119,9 @@ def show(model: SAID, settings: dict[str, Any], sets_answer: bool) -> None:
 
 
 def let_answer(model: SAID, who: Answer, up_to: int | None, since: int | None) -> None:
-    """Let one of them answer, or both, each at ages of its own.
+    """Set who answers; with ``both``, expert and planner answer at ages of their own.
 
-    :raises ValueError: for both without an age, or an age without both
+    :raises ValueError: for ``both`` without an age, or an age without ``both``
     """
     if (who == "both") != (up_to is not None or since is not None):
         raise ValueError("--answer both and --expert-up-to or --expert-from need each other.")
@@ -129,9 +129,9 @@ def let_answer(model: SAID, who: Answer, up_to: int | None, since: int | None) -
 
 
 def check_target(path: Path) -> None:
-    """Refuse a target that cannot be written, or holds something else than an agent, such as a run's checkpoint.
+    """Refuse a target that cannot be written, or holds something else than a SAID agent, such as a checkpoint.
 
-    :raises ValueError: for it
+    :raises ValueError: for such a target
     """
     check_writable(path)
     if path.is_file():
@@ -144,9 +144,9 @@ def check_target(path: Path) -> None:
 
 
 def hand_on(model: SAID, agent: Path, output: Path, compact: bool) -> None:
-    """Save an agent with what belongs to it, and say what of its run the file does not keep.
+    """Save an agent with what belongs to it. Print what its run changes in the task, which the file does not keep.
 
-    :param agent: the run's folder, or the file that it was opened from
+    :param agent: the run's folder or the file that it was opened from
     :param output: where to save it
     """
     model.save(output, compact=compact)
@@ -162,7 +162,7 @@ def hand_on(model: SAID, agent: Path, output: Path, compact: bool) -> None:
 
 
 def keep_normalization(agent: Path, output: Path) -> None:
-    """Write the statistics of a run with ``VecNormalize`` beside its new file, too, and leave no others there."""
+    """Copy the statistics of ``VecNormalize``, if the run has any, beside its new file. Leave no others there."""
     found, target = find_normalization(*find_agent(agent)), normalization_file(output)
     if found is None and target.exists():
         target.unlink()
@@ -179,7 +179,7 @@ def number_or_none(word: str) -> float | str:
 
 
 def load_said(path: Path) -> SAID:
-    """Open an agent by itself: no task is made.
+    """Open an agent without making its task.
 
     :raises ValueError: when it is not a SAID agent
     """

@@ -25,14 +25,14 @@ class DepthPlanners:
     """Trains planners of any depth on a run's replay, and puts them into its agent.
 
     A depth's weights are kept in ``FOLDER/planner_depthN.zip``, for all workers. The run's own planner serves its depth
-    when it had as many updates. The agent's planner is replaced in place; its expert stays as it is.
+    if it had as many updates. The agent gets each planner in turn; its expert stays as it is.
 
     :param model: the run's agent
-    :param checkpoint: the run's ``checkpoint.zip``, which holds the replay; read when a planner has to be trained
+    :param checkpoint: the run's ``checkpoint.zip`` with the replay; read when a planner has to be trained
     :param folder: for the planners
     :param gradient_steps: updates of each planner; the agent's ``planner_gradient_steps`` by default
     :param progress_bar: show one while training
-    :param dataset: logs that the run learned from, in the checkpoint's place
+    :param dataset: logs that the run learned from; they are read instead of the checkpoint
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class DepthPlanners:
         self.dataset = dataset
         self.model, self.checkpoint, self.folder, self.progress_bar = model, checkpoint, folder, progress_bar
         self.gradient_steps = gradient_steps or model.planner_gradient_steps
-        self.config = replace(model.policy.planner.config, decided_by="plan")  # else the tries would all be alike
+        self.config = replace(model.policy.planner.config, decided_by="plan")  # else all trials would be alike
         serves = int(model.policy.planner_updates) == self.gradient_steps
         self._own = model.policy.planner if serves else None
         self._agent = f"{crc32(weight.numpy(force=True) for weight in model.policy.parameters()):08x}"
@@ -57,11 +57,11 @@ class DepthPlanners:
         return self.folder / f"planner_depth{depth}.zip"
 
     def training(self, depth: int) -> dict[str, Any]:
-        """Return what decides a planner's weights, in JSON types; of the run that is its replay, told by its agent."""
+        """Return what decides a planner's weights, in JSON types. The agent's checksum stands for the replay."""
         return {
             "agent": self._agent,
             "gradient_steps": self.gradient_steps,
-            # As of a replay that holds the logs, which is not there where nothing is left to train
+            # With logs it is 1.0. The agent says so only once they are loaded; they are not if nothing is left to train
             "newest_fraction": 1.0 if self.dataset else self.model.newest_fraction,
             "terminal_penalty": self.model.planner_terminal_penalty,
             "training_seed": self.model.seed or 0,
@@ -70,9 +70,9 @@ class DepthPlanners:
         }
 
     def train(self, depths: Sequence[int]) -> None:
-        """Train each depth unless it is there; first those that no other worker trains, then wait for the rest.
+        """Train each depth that is not there yet: first those that no other worker trains. Then wait for the rest.
 
-        A training that died goes on from its checkpoint.
+        A killed training goes on from its checkpoint.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         for waits in (False, True):
@@ -100,12 +100,12 @@ class DepthPlanners:
             check_tensors("planner", saved["planner"], policy.planner.state_dict())
             policy.planner.load_state_dict(saved["planner"])
         policy.planner_updates.fill_(float(self.gradient_steps))
-        policy.set_answer("planner")  # whoever the run let answer
+        policy.set_answer("planner")  # in place of whoever answers in the run
 
     def _train(self, depth: int) -> None:
         planner = self._own
         if planner is None or planner.config.depth != depth:
-            with seeded(self.model.seed or 0):  # the same weights to begin with, whichever worker trains them
+            with seeded(self.model.seed or 0):  # the first weights are the same, whichever worker trains
                 self.model.policy.make_planner(replace(self.config, depth=depth))
             self._load_replay()
             self._update_planner(depth)
@@ -136,7 +136,7 @@ class DepthPlanners:
         self.model.set_logger(Logger(str(folder), [log]))
         print(f"Training the planner of depth {depth}: {self.gradient_steps} updates", flush=True)
         policy = self.model.policy
-        values, policy.values = policy.values, None  # all depths share that of the run
+        values, policy.values = policy.values, None  # all depths share the run's V(s): None trains no other
         stopping = Stopping()
         try:
             with stopping.listening():

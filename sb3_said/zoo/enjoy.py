@@ -56,7 +56,7 @@ class CannotDraw(ImportError):
 
 
 class Video:
-    """Writes the steps of a task to an mp4 or a GIF that plays in real time, by leaving out steps.
+    """Writes a task to an mp4 or a GIF that plays in real time: steps between its frames are left out.
 
     :param path: ending in .mp4 or .gif
     :param fps: frames a second, at most one for each control step
@@ -73,11 +73,11 @@ class Video:
         """Take a frame, if one is due.
 
         :raises CannotDraw: without a working graphics library
-        :raises ValueError: where the task draws no frames, as it says in its metadata or shows
+        :raises ValueError: where the task draws no frames, by its metadata or by what it returns
         """
         rate = env.metadata.get("render_fps") or self.fps  # control steps a second
         self.fps = min(self.fps, rate)
-        if self.path.suffix == ".gif":  # which counts in hundredths of a second
+        if self.path.suffix == ".gif":  # a GIF counts in hundredths of a second
             self.fps = 100 / math.ceil(100 / self.fps - 1e-9)
         due = self._steps * self.fps / rate + 1e-9
         self._steps += 1
@@ -120,7 +120,7 @@ class Video:
 
 
 class SideBySide(Video):
-    """A video of pairs of plays of one start, the first on the left; the one that ends first stays there, darker."""
+    """A video of pairs of plays from one start, the first on the left. The shorter one keeps its last frame, darker."""
 
     def __init__(self, path: Path, fps: int):
         super().__init__(path, fps)
@@ -128,7 +128,7 @@ class SideBySide(Video):
         self._n_written = 0
 
     def begin(self) -> None:
-        """Say that the next steps are of the next play."""
+        """Begin the next play: the steps that follow belong to it."""
         if len(self._plays) == 2:
             self._write()
         self._plays.append([])
@@ -149,14 +149,14 @@ class SideBySide(Video):
 
     def close(self) -> None:
         is_pair = len(self._plays) == 2 and all(self._plays)
-        if is_pair or not self._n_written:  # of a video of pairs, one that was interrupted alone has another size
+        if is_pair or not self._n_written:  # a play without its pair has another size than pairs
             self._write()
         self.frames = self._n_written
         super().close()
 
 
 def follow(env: gym.Env[Any, Any]) -> None:
-    """Use a MuJoCo task's own tracking camera, where the default one stays behind while the robot runs away."""
+    """Use a MuJoCo task's own tracking camera: the default one stays behind while the robot runs away."""
     renderer = getattr(getattr(env, "unwrapped", None), "mujoco_renderer", None)
     if renderer is not None and renderer.camera_id in (None, -1):
         import mujoco
@@ -165,9 +165,9 @@ def follow(env: gym.Env[Any, Any]) -> None:
 
 
 def check_can_record(path: Path) -> None:
-    """Fail before an agent is loaded, with what to install.
+    """Fail before an agent is loaded, and say what to install.
 
-    :raises ValueError: for a file that is no video, and a folder
+    :raises ValueError: for a file that is no video, and for a folder
     :raises OSError: where the file cannot be written
     :raises ImportError: without imageio
     """
@@ -180,12 +180,12 @@ def check_can_record(path: Path) -> None:
 
 @contextmanager
 def naming_libraries() -> Iterator[None]:
-    """Say what to install where a task of MuJoCo cannot be made, as the library that MUJOCO_GL names is not there."""
+    """Say what to install if a task of MuJoCo cannot be made because the library that MUJOCO_GL names is missing."""
     try:
         yield
     except (ImportError, AttributeError, OSError) as error:
         try:
-            import_module("mujoco")  # which loads it
+            import_module("mujoco")  # loads that library
         except Exception as cause:
             raise CannotDraw(cause) from error
         raise
@@ -225,7 +225,7 @@ def main(argv: list[str] | None = None) -> None:
             raise ValueError(f"--beside-ignorant needs an agent that is told an age; {args.run} knows no delay.")
         with answering(run.model, args.answer), closing(video) if video else nullcontext():
             if args.beside_ignorant and isinstance(run.model, DelayedSAC):
-                run.model.check_ages([0])  # as it is told
+                run.model.check_ages([0])  # the age that it is told
             if not isinstance(video, SideBySide):
                 show(run, args, video, args.seed, args.episodes)
             else:
@@ -243,7 +243,7 @@ def show(
     """Play episodes and print how each ended.
 
     :param seed: of the first one's reset
-    :param age_error: control steps that the age is told wrong by
+    :param age_error: control steps by which the age is told wrong
     """
     told = ", told that every observation is new" if age_error else ""
     run.play(

@@ -69,8 +69,8 @@ def main(argv: list[str] | None = None) -> None:
 def opened(args: argparse.Namespace) -> tuple[dict[str, LoadedRun], Path, float]:
     """Check the options and open the agents, before any episode.
 
-    :return: the last agent and the best, as far as there are two; the file of the numbers; seconds of a control step in
-        real time
+    :return: the last and the best agent, or the only one; the file for the numbers; seconds of a control step in real
+        time
     :raises ValueError: for an option that cannot work
     """
     check_positive(args, "episodes", "n_envs", "num_threads")
@@ -80,12 +80,12 @@ def opened(args: argparse.Namespace) -> tuple[dict[str, LoadedRun], Path, float]
         raise ValueError(f"--period takes seconds above 0 and needs --realtime, got {args.period}.")
     th.set_num_threads(args.num_threads)
     if args.plot is not None:
-        plots.check_file(args.plot)  # what cannot be drawn is told now, and not after the episodes
+        plots.check_file(args.plot)  # refuse now what cannot be drawn, not after the episodes
         check_writable(args.plot)
     played: dict[str, Any] = {"algo": args.algo, "env_id": args.env, "delay": read_delay(args.delay)}
     played |= {"device": args.device, "gym_packages": args.gym_packages}
     run = load_run(args.run, **played)
-    if args.realtime and not args.delay and run.own_delay is None:  # what answers take is all the delay there is
+    if args.realtime and not args.delay and run.own_delay is None:  # the time of answers is all the delay
         played["delay"] = 0
         run = load_run(args.run, **played)
     best = run.folder / BEST_NAME
@@ -106,7 +106,7 @@ def opened(args: argparse.Namespace) -> tuple[dict[str, LoadedRun], Path, float]
 
 def check_replaceable(target: Path) -> None:
     """
-    :raises ValueError: for a file of something else than numbers that this command wrote
+    :raises ValueError: for a file that holds something else than this command's numbers
     """
     if not target.is_file() or not (text := target.read_text(errors="replace")):
         return
@@ -121,7 +121,7 @@ def check_replaceable(target: Path) -> None:
 def measure(args: argparse.Namespace, runs: dict[str, LoadedRun], target: Path, period: float) -> None:
     """Play and time the agents, print a table, and write the numbers.
 
-    :param runs: the last agent, or the best where there is no other, and the best
+    :param runs: the last and the best agent, or the only one
     """
     run = next(iter(runs.values()))
     last_seed = args.seed + args.episodes - 1
@@ -201,7 +201,7 @@ def score_of(summary: Summary, env_id: str) -> list[float] | None:
 
 
 def print_table(played: list[tuple[str, Summary]], env_id: str = "") -> None:
-    """Print one line for each answer, with the columns of the last agent and, where it is another, of the best.
+    """Print one line for each answer, with columns for the last agent and for the best, if that is another.
 
     :param played: which of the two, "last" or "best", and what it did
     :param env_id: of a task, for the score
@@ -220,7 +220,7 @@ def print_table(played: list[tuple[str, Summary]], env_id: str = "") -> None:
 
 
 def _columns(summary: Summary | None, env_id: str) -> str:
-    if summary is None:  # who could not answer yet when the best one was saved
+    if summary is None:  # this answer did not exist yet when the best agent was saved
         return f"{'-':>12} {'-':>24} {'-':>7} {'-':>8}"
     mean, scores = summary.mean_return, score_of(summary, env_id)
     interval = f"[{mean.low:,.1f}, {mean.high:,.1f}]"

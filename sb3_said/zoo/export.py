@@ -45,7 +45,7 @@ def main(argv: list[str] | None = None) -> None:
 
 
 class SpacesAlone(gym.Env[Any, Any]):
-    """What SB3 asks of an environment before it reads statistics of an agent's observations."""
+    """The spaces of an agent: SB3 asks no more of an environment before it reads statistics of observations."""
 
     def __init__(self, model: SAID) -> None:
         self.observation_space, self.action_space = model.observation_space, model.action_space

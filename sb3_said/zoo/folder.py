@@ -19,7 +19,7 @@ TUNED_NAME, TUNED_SETTINGS = "best.zip", "best.yml"  # what sb3-said tune leaves
 
 
 def claim_folder(parent: Path, name: str, suffix: str = "") -> Path:
-    """Make ``parent/name_K`` with the first free K after the largest there is; of two that ask, each gets its own."""
+    """Make ``parent/name_K``, where K follows the largest number there. Two processes get two folders."""
     parent.mkdir(parents=True, exist_ok=True)
     taken = [path.name.removeprefix(f"{name}_").split("_")[0] for path in parent.glob(f"{name}_[0-9]*")]
     number = max([int(text) for text in taken if text.isdigit()], default=0)
@@ -27,19 +27,19 @@ def claim_folder(parent: Path, name: str, suffix: str = "") -> Path:
         number += 1
         folder = parent / f"{name}_{number}{suffix}"
         try:
-            folder.mkdir()  # atomic: where another process has made it, this fails
+            folder.mkdir()  # atomic: it fails if another process has made the folder
             return folder
         except FileExistsError:
             continue
 
 
 def resuming(folder: Path) -> str:
-    """Return the option that goes on with a run, as a shell takes it."""
+    """Return the option that goes on with a run, quoted for a shell."""
     return f"--resume {shlex.quote(str(folder))}"
 
 
 def hold_folder(folder: Path) -> FileLock:
-    """Hold a run's folder until the lock is released or the process ends, and remove what killed writes left there.
+    """Hold a run's folder until the lock is released or the process ends. Remove what killed writes left there.
 
     :raises ValueError: while another process trains there
     """
@@ -63,9 +63,9 @@ def log_suffix(folder: Path, steps: int) -> str:
 
 
 def drop_undone_episodes(checkpoint: Path) -> None:
-    """Cut from SB3's monitor files beside a checkpoint the episodes that a resume undoes: those that ended after it.
+    """Cut from SB3's monitor files the episodes that a resume undoes: those that ended after the checkpoint.
 
-    The episode during which the checkpoint was written is missing from the files.
+    The episode during which the checkpoint was written stays missing from the files.
     """
     noted = load_metadata(checkpoint)["metadata"].get("monitors")
     for file in checkpoint.parent.glob("*.monitor.csv"):
@@ -103,12 +103,13 @@ def find_agent(path: Path) -> tuple[Path, Record | None]:
 
 
 def find_normalization(file: Path, record: Record | None) -> Path | None:
-    """Return where an agent's statistics of ``VecNormalize`` are, None without.
+    """Return the file of an agent's statistics of ``VecNormalize``, None without.
 
-    Statistics of observations beside an agent that was taught on observations as they are belonged to another one of
-    its name: they are left out, with a warning. rl_zoo3's checkpoints are played with the last agent's, and a warning.
+    An agent may have learned from observations as they are. Statistics of observations beside it then belonged to
+    another agent of its name: they are left out, with a warning. rl_zoo3's checkpoints have no statistics of their own.
+    They are played with those of the last agent, with a warning.
 
-    :param file: of the agent; this and the next as :func:`find_agent` returns them
+    :param file: of the agent; ``file`` and ``record`` are as :func:`find_agent` returns them
     :raises SavedFileError: where the statistics cannot be read
     """
     own = normalization_file(file)

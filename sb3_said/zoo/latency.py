@@ -1,4 +1,4 @@
-"""What the time that answers take costs an agent: episodes in which the task does not wait for them."""
+"""What slow answers cost an agent: episodes in which the task does not wait for them."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from sb3_said.evaluation import Summary, rollout
 from sb3_said.realtime import ControlLoop, LoopedModel
 from sb3_said.zoo.runs import LoadedRun, answering
 
-#: How rows are called, and whether the agent counts the time of its answers as delay.
+#: Names of the rows, and whether the agent counts the time of its answers as delay.
 REAL_TIME = {"in real time": True, "latency ignored": False}
 
 
 def evaluate_in_real_time(
     run: LoadedRun, answer: str | None, n_episodes: int, seed: int, period: float, deterministic: bool = True
 ) -> list[tuple[Summary, dict[str, Any]]]:
-    """Play episodes in which the task goes on while this machine answers, and hold the last action where none is there.
+    """Play episodes in which the task goes on while this machine answers. Without a new action the last is held.
 
-    The time of every answer is measured, in periods that have begun. One row counts it as part of the delay; the other
-    sends an answer whenever it arrives, as if it had taken no time.
+    The time of every answer is measured and rounded up to whole periods. One row counts it as part of the delay. The
+    other sends an answer whenever it arrives, as if it had taken no time.
 
-    :param answer: who answers, as of :func:`~sb3_said.zoo.runs.answers`
+    :param answer: who answers: one of :func:`~sb3_said.zoo.runs.answers`
     :param period: of the control loop, in seconds
     :return: for each row of ``REAL_TIME`` its episodes, and what its loop counted
     """

@@ -56,9 +56,9 @@ from sb3_said.zoo.presets import config_file, preset_overrides
 from sb3_said.zoo.record import ENDED_NAME, EVALUATED, GIVEN_NAME, Record, make_wrapper, options_of, with_delay
 from sb3_said.zoo.stopping import Stopping, shield
 
-LONGEST_NAME = 100  # of what a folder says of delays and logs; file systems end at 255
+LONGEST_NAME = 100  # of what a folder's name says of delays and logs; file systems allow 255
 
-VEC_WRAPPERS = "frame_stack", "vec_env_wrapper"  # of rl_zoo3; no command can play their agents
+VEC_WRAPPERS = "frame_stack", "vec_env_wrapper"  # of rl_zoo3; no command of ours could play their agents
 for _name in ALGORITHMS:
     HYPERPARAMS_SAMPLER[_name] = HYPERPARAMS_SAMPLER["sac"]
     HYPERPARAMS_CONVERTER[_name] = HYPERPARAMS_CONVERTER["sac"]
@@ -72,7 +72,7 @@ class Run:
     :param preset: see ``preset_overrides``
     :param checkpoint_freq: environment steps between checkpoints; by default time decides
     :param resume: folder of the run to continue
-    :param expert_delay: what the expert learns under, ``delay`` by default; the planner serves ``delay`` in any case
+    :param expert_delay: delay that the expert learns under, ``delay`` by default; the planner always serves ``delay``
     :param record: of the run to continue
     :param dataset: logs to learn from instead of an environment: paths, and ids of Minari datasets
     """
@@ -87,7 +87,7 @@ class Run:
 
     @property
     def name(self) -> str:
-        """What paths say of it, e.g. ``-delay4``, ``-delayUniformDelay-0-8``, ``-delay0-8-expert0``, ``-medium-v0``."""
+        """Its name in paths, e.g. ``-delay4``, ``-delayUniformDelay-0-8``, ``-delay0-8-expert0``, ``-medium-v0``."""
         parts = [("delay", self.delay), ("expert", self.expert_delay)]
         words = {name: "-".join(re.findall(r"[\w.]+", str(delay))) for name, delay in parts if delay is not None}
         logs = [Path(source).stem if is_file(source) else source.rpartition("/")[2] for source in self.dataset]
@@ -105,7 +105,7 @@ class DelayedExperimentManager(ExperimentManager):
     """rl_zoo3's manager with delays, presets and resumable runs.
 
     :param run: what our command line adds
-    :param args: rl_zoo3's parsed arguments, then its own parameters
+    :param args: rl_zoo3's parsed arguments; the parameters after it are those of rl_zoo3's manager
     :raises ValueError: for a run that another process trains, or that cannot go on
     """
 
@@ -141,7 +141,7 @@ class DelayedExperimentManager(ExperimentManager):
                 )
             run.record.require(*(set(run.record.missing) - {*given}))
             run.record.check_hyperparams()
-            self.lock = hold_folder(run.resume)  # once nothing can fail: who has no manager cannot let go of it
+            self.lock = hold_folder(run.resume)  # after all that can fail: without a manager nobody could release it
             self._set_folder(run.resume)
             self.custom_hyperparams = with_given(run.record.hyperparams, given, NESTED)
             given_env, self.env_kwargs = self.env_kwargs, {**run.record.env_kwargs, **self.env_kwargs}
@@ -150,7 +150,7 @@ class DelayedExperimentManager(ExperimentManager):
             self.eval_env_kwargs = {**run.record.eval_env_kwargs, **given_eval}
         else:
             overrides = preset_overrides(self.config, run.preset, env_id, run.delay, run.max_delay, run.dataset)
-            # A trial in the expert's environment would tell who is better there, and not under the planner's delay
+            # A trial would play under the expert's delay, and tell nothing of the planner's
             if run.expert_delay is not None:
                 overrides["planner_trial_episodes"] = 0
             self.custom_hyperparams = with_given({**overrides, **ALGORITHMS[algo][1]}, given, NESTED)
@@ -164,8 +164,11 @@ class DelayedExperimentManager(ExperimentManager):
         self.save_path, self.params_path = str(folder), f"{folder}/{self.env_name}"
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Read them as rl_zoo3 does, with the delay around the user's own wrappers, and text that is code evaluated."""
-        if self.run.record is None:  # of settings in settings, rl_zoo3 would drop those of the file
+        """Read hyper-parameters as rl_zoo3 does.
+
+        The delay goes around the user's own wrappers, and text that is code is evaluated.
+        """
+        if self.run.record is None:  # rl_zoo3 would replace dicts of settings whole, instead of merging them
             given, self.custom_hyperparams = self.custom_hyperparams or {}, None
             with redirect_stdout(StringIO()):
                 of_file, _ = super().read_hyperparameters()
@@ -175,7 +178,7 @@ class DelayedExperimentManager(ExperimentManager):
         if self.n_timesteps <= 0 and "n_timesteps" not in hyperparams:
             raise ValueError(f"{self.config} says no n_timesteps for {self.env_name.gym_id}: add it, or give -n.")
         hyperparams.setdefault("n_timesteps", self.n_timesteps)
-        if self.run.record is not None:  # the run has all of its own, and none of what its YAML holds today
+        if self.run.record is not None:  # the run has all its settings; what only today's YAML holds is none of it
             for settings in (hyperparams, saved):
                 for name in set(settings) - set(self.custom_hyperparams or {}):
                     del settings[name]
@@ -193,7 +196,7 @@ class DelayedExperimentManager(ExperimentManager):
         return hyperparams, saved
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
-        """Preprocess them as rl_zoo3 does; evaluations are of the task as the YAML has it, too."""
+        """Preprocess hyper-parameters as rl_zoo3 does; evaluations get the YAML's ``env_kwargs``, too."""
         if refused := [name for name in VEC_WRAPPERS if hyperparams.get(name)]:
             raise ValueError(
                 f"{', '.join(refused)} wraps all environments at once, and no command could play the agent: put "
@@ -227,7 +230,7 @@ class DelayedExperimentManager(ExperimentManager):
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         """Make the agent as rl_zoo3 does. Settings that do not fit end the program, and leave no new folder behind.
 
-        :raises SystemExit: for them
+        :raises SystemExit: for settings that do not fit
         """
         is_new, made = self.lock is None, None
         try:
@@ -235,7 +238,7 @@ class DelayedExperimentManager(ExperimentManager):
                 made = self._set_up()
                 return made
         finally:
-            if made is None and is_new and self.lock is not None:  # -optimize, too, writes elsewhere
+            if made is None and is_new and self.lock is not None:  # it failed, or was -optimize, which writes elsewhere
                 self.release()
                 shutil.rmtree(self.folder)
 
@@ -244,15 +247,15 @@ class DelayedExperimentManager(ExperimentManager):
             Path(self.tensorboard_log).mkdir(parents=True, exist_ok=True)
         made = super().setup_experiment()
         if made is not None and isinstance(made[0], SAID):
-            has_its_own = self.run.expert_delay is not None  # then the planner's is not that of the environments now
+            has_its_own = self.run.expert_delay is not None  # the environments now have the expert's delay
             ages = ages_under(self.run.delay) if has_its_own else ages_of(made[0].env)
             made[0].policy.planner.check_ages(ages)
         return made
 
     def create_envs(self, *args: Any, **kwargs: Any) -> VecEnv:
-        """Make environments of the expert's delay, in training as in the evaluations beside it.
+        """Make environments under the expert's delay, for training and for the evaluations beside it.
 
-        The run's settings on disk keep the delay that the agent is for, and its own evaluation is under that.
+        The run's settings on disk keep the delay that the agent is for. The trained agent is evaluated under that one.
         """
         if self.run.expert_delay is not None:
             delays = self.run.expert_delay, self.run.delay
@@ -260,15 +263,15 @@ class DelayedExperimentManager(ExperimentManager):
                 with_delay(self._own_wrappers, *(delays if self._under_expert_delay else delays[::-1]))
             )
         if self.vec_env_class is SubprocVecEnv:
-            shield()  # the training needs its environments to its end
+            shield()  # Ctrl-C must not end them before the training ends
         env = super().create_envs(*args, **kwargs)
         if not self._has_told_of_no_delay and "action_history" not in getattr(env.observation_space, "spaces", {}):
-            self._has_told_of_no_delay = True  # a task may be registered with its delay, so its wrappers do not say
+            self._has_told_of_no_delay = True  # by the spaces: a task may be registered with its delay
             print(f"NO DELAY: this trains on {self.env_name.gym_id} without any delay; --delay 4 adds one of 4 steps.")
         return env
 
     def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
-        """Normalise as rl_zoo3 does, but read what a given agent (-i) learned from a file without pickle."""
+        """Normalise as rl_zoo3 does, but read the statistics of a given agent (-i) from a file without pickle."""
         given = find_normalization(*find_agent(Path(self.trained_agent))) if self.continue_training else None
         if given is not None:
             env = load_normalization(given, env, training=not eval_env)
@@ -280,7 +283,7 @@ class DelayedExperimentManager(ExperimentManager):
 
     @property
     def folder(self) -> Path:
-        """The run's."""
+        """The run's folder."""
         return Path(self.save_path)
 
     @property
@@ -302,7 +305,7 @@ class DelayedExperimentManager(ExperimentManager):
         self.monitor_kwargs["override_existing"] = not self.checkpoint.exists()
 
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
-        """Write them; of a resume, :meth:`learn` does so once the checkpoint has been found to fit."""
+        """Write the run's settings. In a resume :meth:`learn` writes them, once the checkpoint is known to fit."""
         self._to_save = saved_hyperparams
         if self.run.record is None:
             self._write_config()
@@ -348,7 +351,7 @@ class DelayedExperimentManager(ExperimentManager):
         self._add_checkpoints()
 
     def _evaluated_in(self) -> Path:
-        """Return the folder of what is evaluated in training: of SAID its expert, which learns then."""
+        """Return the folder for evaluations during training. In SAID it is the expert that learns then."""
         return self.folder / EXPERT_FOLDER if self.algo == "said" else self.folder
 
     def _add_checkpoints(self) -> None:
@@ -356,7 +359,7 @@ class DelayedExperimentManager(ExperimentManager):
         self.callbacks.append(self.checkpointing)
         if self.algo == "said":
             how: dict[str, Any] = {"progress_bar": self.show_progress, "should_stop": self.stopping}
-            if self.evaluation is not None:  # else the training's may be the only one, as of a robot
+            if self.evaluation is not None:  # else the training's may be the only environment, as on a robot
                 how["make_trial_env"] = partial(self.create_envs, no_log=True)
             self.callbacks.append(PlannerTrainingCallback(self.folder, **how))
 
@@ -374,8 +377,8 @@ class DelayedExperimentManager(ExperimentManager):
                 restore_training(model, self.checkpoint, callbacks)  # type: ignore[arg-type]  # one of ALGORITHMS
             with ending_training(ValueError):
                 self._check_more_steps(model.num_timesteps)
-                if isinstance(model, SAID) and model.policy.planner_is_trained:  # else it is made as was asked for
-                    # Where a trial has chosen among ways, what the run began with is none of them
+                if isinstance(model, SAID) and model.policy.planner_is_trained:  # an untrained one is made as asked
+                    # Where a trial chooses among ways, the settings that the run began with must not undo its choice
                     asked = self._given if model.planner_ways else self.custom_hyperparams or {}
                     _decide_as_given(model, asked.get("planner_kwargs", {}))
             print(f"Resuming {self.save_path} at step {model.num_timesteps}")
@@ -394,7 +397,7 @@ class DelayedExperimentManager(ExperimentManager):
                 if self.stopping.is_asked:
                     raise KeyboardInterrupt
         except SystemExit:
-            if self.run.record is not None:  # the planner's checkpoint is of the settings before
+            if self.run.record is not None:  # the planner's checkpoint still has these settings
                 self.run.record.write(self.folder)
             if had_ended is not None:
                 write_text(ended, had_ended)
@@ -415,10 +418,10 @@ class DelayedExperimentManager(ExperimentManager):
 
     def _check_more_steps(self, taken: int) -> None:
         """
-        :raises ValueError: for a -n of fewer steps than the run has taken, which no record should say it has
+        :raises ValueError: for a -n below the steps that the run has taken: no record should say so
         """
         record = self.run.record
-        assert record is not None  # a checkpoint is of a run that is resumed
+        assert record is not None  # only a resumed run has a checkpoint
         if self.n_timesteps < min(taken, record.n_timesteps or taken):
             raise ValueError(
                 f"{self.save_path} has taken {taken} steps: give -n more than that, or leave it out, got "
@@ -426,7 +429,7 @@ class DelayedExperimentManager(ExperimentManager):
             )
 
     def _learn(self, model: Any, steps: int, **how: Any) -> None:
-        """Learn for so many steps, and evaluate the planner where there is one."""
+        """Learn for ``steps`` steps. Then evaluate a SAID agent as it answers, once its planner is trained."""
         model.learn(steps, **how)
         is_answer = isinstance(model, SAID) and model.policy.planner_is_trained
         if is_answer and self.evaluation is not None and not self.stopping.is_asked:
@@ -437,16 +440,16 @@ class DelayedExperimentManager(ExperimentManager):
             evaluate_answer(model, self.evaluation, self.folder, self.stopping)
 
     def _save_checkpoint(self, model: Any) -> bool:
-        """Write a checkpoint of a training that is asked to stop; return whether the file has it all."""
+        """Write a checkpoint when the training is asked to stop; return whether the file holds all of it."""
         return self.checkpointing.save()
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
-        """Save as rl_zoo3 does, which takes a task's name with a dot for a file's with a suffix, and without pickle."""
+        """Save as rl_zoo3 does, but without pickle. The suffix .zip is added even if the task's name has a dot."""
         assert isinstance(model, DelayedSAC)
-        model.task = self.env_name.gym_id  # which environments in other processes do not tell
+        model.task = self.env_name.gym_id  # environments in other processes do not tell it
         file = self.folder / f"{self.env_name}.zip"
         is_unfinished = self.stopping.is_asked and isinstance(model, SAID) and not model.planner_is_current
-        if is_unfinished and _is_whole(file):  # of a run that had ended, and is trained for longer
+        if is_unfinished and _is_whole(file):  # from before the run was trained for longer
             print(f"{file} stays as it was, with its planner.")
             return
         print(f"Saving to {self.save_path}")
@@ -489,7 +492,7 @@ class SaveNormalization(BaseCallback):
 
 
 def _decide_as_given(model: SAID, given: dict[str, Any]) -> None:
-    """Take what a command says of how to decide over what its checkpoint does, whose planner stays.
+    """Let a command's settings of how to decide replace the checkpoint's. The planner itself stays.
 
     :raises ValueError: for the ``mask`` of another planner
     """
@@ -500,7 +503,7 @@ def _decide_as_given(model: SAID, given: dict[str, Any]) -> None:
 
 
 def number_of(setting: Any) -> Any:
-    """Return the number that a text is, for which YAML takes ``1e-3``; anything else as it is."""
+    """Return the number that a text stands for, anything else as it is. YAML reads ``1e-3`` as text."""
     if not isinstance(setting, str):
         return setting
     try:
@@ -511,7 +514,7 @@ def number_of(setting: Any) -> Any:
 
 
 def _is_whole(file: Path) -> bool:
-    """Tell whether a file has an agent, and that its planner."""
+    """Tell whether a file holds an agent with its current planner."""
     try:
         return file.is_file() and SAID.load(file, device="cpu").planner_is_current
     except SavedFileError:

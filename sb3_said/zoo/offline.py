@@ -1,4 +1,4 @@
-"""Runs that learn from logs: their environment is made for its spaces and its delay, and no step of it is taken."""
+"""Runs that learn from logs. Their environment gives spaces and delay; the training takes no step in it."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from sb3_said.zoo.manager import DelayedExperimentManager, Run
 
 
 class OfflineExperimentManager(DelayedExperimentManager):
-    """The manager for ``--dataset``. Steps are gradient steps, those of the planner in SAID.
+    """The manager for ``--dataset``. Steps are gradient steps; in SAID, those of the planner.
 
     :param run: what our command line adds
-    :param args: rl_zoo3's parsed arguments, then its own parameters
+    :param args: rl_zoo3's parsed arguments; the parameters after it are those of rl_zoo3's manager
     :raises ValueError: for a run that another process trains or that cannot go on, and for an option without effect
     """
 
@@ -41,7 +41,7 @@ class OfflineExperimentManager(DelayedExperimentManager):
     def _set_up(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         """Make the agent as rl_zoo3 does, and read the dataset."""
         made = super()._set_up()
-        assert made is not None and isinstance(made[0], OfflineAlgorithm)  # no -optimize, as the constructor saw to
+        assert made is not None and isinstance(made[0], OfflineAlgorithm)  # the constructor refuses -optimize
         model = made[0]
         model.take_dataset([*self.run.dataset], self.show_progress)
         replay = model.replay_buffer
@@ -55,22 +55,23 @@ class OfflineExperimentManager(DelayedExperimentManager):
         return made
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
-        """Make environments without a file of their episodes."""
+        """Make environments that write no monitor file."""
         return super().create_envs(n_envs, eval_env, no_log=True)
 
     def create_callbacks(self) -> None:
-        n_envs, self.n_envs = self.n_envs, 1  # by which rl_zoo3 divides how often; a gradient step is one step
-        super().create_callbacks()  # whose bar counts the steps of environments
+        n_envs, self.n_envs = self.n_envs, 1  # rl_zoo3 divides intervals by it; a gradient step is one step
+        super().create_callbacks()
         self.n_envs = n_envs
+        # rl_zoo3's progress bar counts the steps of environments
         self.callbacks = [c for c in self.callbacks if not isinstance(c, ProgressBarCallback)]
 
     def _evaluated_in(self) -> Path:
-        return self.folder  # there is no expert: it is the agent that is evaluated
+        return self.folder  # there is no expert: evaluations are of the agent
 
     def _add_checkpoints(self) -> None:
         freq, stopping = self.run.checkpoint_freq, self.stopping
         self.checkpointing = TrainingCheckpointCallback(self.folder, freq, stopping, keeps_replay=False)
-        if self.algo != "said":  # whose planner keeps its own
+        if self.algo != "said":  # SAID's planner writes its own
             self.callbacks.append(self.checkpointing)
 
     def _learn(self, model: Any, steps: int, **how: Any) -> None:

@@ -84,9 +84,9 @@ def main(argv: list[str] | None = None) -> None:
         check_positive(args, "episodes", "n_envs", "workers", "num_threads")
         th.set_num_threads(args.num_threads)
         if args.plot is not None:
-            plots.check_file(args.plot)  # what cannot be drawn is told now, and not after the episodes
+            plots.check_file(args.plot)  # refuse now what cannot be drawn, not after the episodes
             check_writable(args.plot)
-        # By process, which may be written in two ways: a second column of it would count as another training seed
+        # By process: one that is written in two ways is played once and has one column
         named: dict[str, int | str] = {}
         for name in map(read_name, args.delays or ()):
             named.setdefault(repr(make_process(name)), name)
@@ -107,7 +107,7 @@ def show(
     """Print the tables of cells that were played, and draw them.
 
     :param rows: agents, each with the name that the table shows
-    :param delays: in the order of the columns; that of the cells by default
+    :param delays: in the order of the columns; by default that of the cells
     :param settings: what all cells have in common
     :param plot: where to draw to
     """
@@ -133,7 +133,7 @@ def show(
 def read_name(word: str) -> int | str:
     """Return the number of a fixed delay, and another process as it is written.
 
-    :raises ValueError: for no delay
+    :raises ValueError: for a word that is no delay
     """
     delay = read_delay([word])
     assert delay is not None  # for mypy: there is a word
@@ -142,10 +142,10 @@ def read_name(word: str) -> int | str:
 
 
 def choose_rows(words: list[str] | None, cells: list[Cell]) -> dict[str, str]:
-    """Return the rows of the table, those asked for or all, each with the name that it is shown under.
+    """Return the rows of the table, all by default, each with the name that the table shows.
 
     :param words: each a row, or ROW=NAME
-    :raises ValueError: for a row that there is not, and a name given twice
+    :raises ValueError: for a row that does not exist, and for a name given twice
     """
     known = list(dict.fromkeys(cell.agent for cell in cells))
     pairs = [(word, "=", word) if word in known else word.partition("=") for word in words or known]
@@ -158,7 +158,7 @@ def choose_rows(words: list[str] | None, cells: list[Cell]) -> dict[str, str]:
 
 
 def known_cells(args: argparse.Namespace, delays: list[int | str]) -> list[Cell]:
-    """Return the cells that a file holds of what the command line asks for, all by default.
+    """Return those cells of a file that the command line asks for, all by default.
 
     :param delays: those of interest, in this order, however the file writes them
     :raises ValueError: without the file, or when it holds nothing of these delays
@@ -223,7 +223,7 @@ def play_missing(args: argparse.Namespace, delays: list[int | str]) -> list[Cell
     with closing(play_all(todo, settings["env"], args)) as played:
         for done, (cell, summary) in enumerate(played, 1):
             result = summary.to_dict()
-            del result["label"]  # another call can give the agent another one
+            del result["label"]  # another call may give the agent another label
             results.add(cell, result, made)
             print(f"{done}/{len(todo)} {cell.agent}, delay {cell.column}: {summary.mean_return}", flush=True)
     results.write()
@@ -245,7 +245,7 @@ def open_runs(args: argparse.Namespace) -> dict[str, list[LoadedRun]]:
     runs: dict[str, list[LoadedRun]] = {}
     for text in args.runs:
         given, path = re.fullmatch(r"(?:([^=/]+)=)?(.*)", text, re.DOTALL).groups()  # type: ignore[union-attr]  # fits all
-        if given and Path(text).exists():  # a folder such as lr=0.1
+        if given and Path(text).exists():  # a path with "=", such as lr=0.1
             given, path = None, text
         label = given or "/".join(Path(path).absolute().parts[-2:]).removesuffix(".zip")
         with at_any_age():
@@ -287,9 +287,9 @@ def at_any_age() -> Iterator[None]:
 
 
 def digest_of(run: LoadedRun) -> str:
-    """Return the SHA-256 of an agent's file, and of what else decides what it sees, if anything.
+    """Return the SHA-256 of an agent's file and of all else that decides what the agent sees.
 
-    That is what its run changes in the task but its delay, and the statistics of ``VecNormalize``.
+    That is what its run changes in the task besides the delay, and the statistics of ``VecNormalize``, if any.
     """
     changes = run.setting.encode() if run.changes else b""
     statistics = b"" if run.statistics is None else run.statistics.read_bytes()
@@ -299,11 +299,11 @@ def digest_of(run: LoadedRun) -> str:
 def cells_of(
     label: str, row: list[LoadedRun], delays: list[int | str], only: str | None = None, age_error: int = 0
 ) -> Iterator[Cell]:
-    """Make the cells of a label: each who can answer, under each delay.
+    """Make the cells of a label: for each run, everyone who can answer, under each delay.
 
-    :param row: runs of one delay, which play all delays; or of several, of which each plays its own
+    :param row: runs of one delay, which all play every delay; or runs of several delays, which each play their own
     :param only: who of a SAID agent is to answer; by default everyone who can
-    :param age_error: control steps that the age is told wrong by
+    :param age_error: control steps by which the age is told wrong
     """
     one_delay = len({run.info["delay"] for run in row}) == 1
     digests = [digest_of(run) for run in row]
@@ -328,9 +328,9 @@ def cells_of(
 def obstacle(run: LoadedRun, answer: str | None, delay: int | str, age_error: int = 0) -> str | None:
     """Say why an agent cannot play under a delay; None where it can.
 
-    :param run: whose action delay, if its task has one, comes on top
+    :param run: the agent; its task's action delay, if any, is added
     :param answer: who acts in a SAID agent
-    :param age_error: control steps that the age is told wrong by
+    :param age_error: control steps by which the age is told wrong
     """
     if age_error and longest_delay(run.model) is None:
         return "it reads no age, so none can be told wrong"
@@ -352,9 +352,9 @@ def obstacle(run: LoadedRun, answer: str | None, delay: int | str, age_error: in
 
 
 def play_all(cells: list[Cell], env_id: str, args: argparse.Namespace) -> Generator[tuple[Cell, Summary], None, None]:
-    """Play cells, in processes if more than one are to be played at once; yields them as they are done.
+    """Play cells, in processes if several are to be played at once. Yield each as soon as it is done.
 
-    Whatever ends it earlier, as Ctrl-C does, ends the processes, too.
+    Whatever ends this earlier, such as Ctrl-C, ends the processes, too.
     """
     how = (env_id, args.episodes, args.seed, args.n_envs, args.device, args.gym_packages)
     if args.workers == 1:
@@ -368,7 +368,7 @@ def play_all(cells: list[Cell], env_id: str, args: argparse.Namespace) -> Genera
     pool = ProcessPoolExecutor(args.workers, context, initializer=begin_worker, initargs=(args.num_threads,))
     try:
         shield()
-        with holding_back_ctrl_c():  # a worker whose start it breaks off tells so in a traceback
+        with holding_back_ctrl_c():  # interrupted at its start, a worker prints a traceback
             futures = {pool.submit(play, cell, *how): cell for cell in cells}
         yield from ((futures[future], future.result()) for future in as_completed(futures))
     except BrokenProcessPool as error:
@@ -377,7 +377,7 @@ def play_all(cells: list[Cell], env_id: str, args: argparse.Namespace) -> Genera
             "same command goes on."
         ) from error
     except (KeyboardInterrupt, GeneratorExit):
-        for worker in multiprocessing.active_children():  # each may have minutes of its cell before it
+        for worker in multiprocessing.active_children():  # its cell may take minutes more
             worker.terminate()
         raise
     finally:
@@ -385,13 +385,13 @@ def play_all(cells: list[Cell], env_id: str, args: argparse.Namespace) -> Genera
 
 
 def begin_worker(num_threads: int) -> None:
-    """Prepare a process that plays cells: with so many threads, and for no longer than the one that asks it to."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; a pool would go on with the next cells
+    """Prepare a process that plays cells: set its number of threads, and end it when its parent ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; a worker would go on with the next cell
     th.set_num_threads(num_threads)
     parent = multiprocessing.parent_process()
     assert parent is not None  # for mypy: a pool calls this
 
-    def end_with_it() -> None:  # whose pool would have ended this, if a kill -9 had let it
+    def end_with_it() -> None:  # a parent ended by kill -9 cannot end its pool
         parent.join()
         os._exit(1)
 

@@ -13,7 +13,7 @@ from sb3_said.zoo.arguments import Delay, ages_under, largest_delay
 
 PRESETS = ("cpu", "paper", "smoke", "quick")
 
-_INSTALLED = Path(__file__).parent / "configs"  # where the wheel puts what a clone has at its top
+_INSTALLED = Path(__file__).parent / "configs"  # where the wheel puts zoo_configs
 CONFIGS = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).resolve().parents[2] / "zoo_configs"
 
 
@@ -27,7 +27,7 @@ def config_file(algo: str, offline: bool = False) -> Path:
 def dataset_kind(dataset: Sequence[str]) -> str:
     """Return which of D4RL's kinds a dataset is by its name: medium-expert, medium-replay, or else medium.
 
-    :param dataset: paths, whose folders say nothing, and ids of Minari datasets
+    :param dataset: paths, of which folders do not count, and ids of Minari datasets
     """
     name = " ".join(Path(source).stem for source in dataset).lower()
     return "medium-replay" if "replay" in name else "medium-expert" if "expert" in name else "medium"
@@ -43,17 +43,21 @@ def preset_overrides(
 ) -> dict[str, Any]:
     """Return what a preset changes for a task: its own entry of ``presets:`` in the file, or the preset's default.
 
-    ``cpu`` changes nothing of the file's block for the task: the constructors' defaults, a
-    ``planner_terminal_penalty`` for tasks that end by falling, and a larger ``gamma`` on legs. Two keys are for
-    planners: ``planner_kwargs: {base: paper, ...}`` starts from ``PlannerConfig.paper()``, and ``planner_by_delay``
-    holds settings to add, by the largest delay and under ``varies`` for delays that are not one number;
-    ``planner_by_dataset`` has such for each kind of dataset. Where the file has a ``by_dataset:`` beside its presets,
-    each of them also gets what that has for the task and the kind of dataset.
+    ``cpu`` changes nothing in the file's block for the task: the constructors' defaults, a
+    ``planner_terminal_penalty`` for tasks that end by falling, and a larger ``gamma`` on legs. Three keys are for
+    planners:
+
+    - ``planner_kwargs: {base: paper, ...}`` starts from ``PlannerConfig.paper()``.
+    - ``planner_by_delay`` adds the settings of the largest delay, and of ``varies`` if the delay is not one number.
+    - ``planner_by_dataset`` has such entries for kinds of datasets. They replace those of the same delay.
+
+    A file may have ``by_dataset:`` beside its presets. Every preset also gets the entry there for the task and the kind
+    of dataset.
 
     :param config: YAML; rl_zoo3 takes Python files, too, which have no presets
-    :param max_delay: length of the action history, the largest of ``delay`` by default; a longer one varies, too
+    :param max_delay: length of the action history, by default the largest of ``delay``; if it is longer, ages vary, too
     :param dataset: logs to learn from, whose names tell their kind
-    :raises ValueError: for a preset the file does not have, and a file that is no YAML of settings
+    :raises ValueError: for a preset that the file does not have, and a file that is no YAML of settings
     """
     is_yaml, kind = Path(config).suffix in (".yml", ".yaml"), dataset_kind(dataset)
     try:

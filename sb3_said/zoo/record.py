@@ -1,6 +1,6 @@
 """``run.json``: what our tools need to make a run's task again and to go on with its training. Reading it runs no code.
 
-rl_zoo3 keeps the same beside it as YAML of Python objects, for its own tools; nothing of ours reads that.
+Beside it rl_zoo3 keeps the same as YAML of Python objects, for its own tools. None of ours reads that YAML.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ GIVEN_NAME = "given.zip"  # the agent that a run began with (-i): it may be move
 WRAPPER = "sb3_said.delays.DelayedObservationWrapper"
 TO_IMPORT = "install it, or name the folder that it lies in with PYTHONPATH."
 
-#: rl_zoo3's options that a resume keeps, by their whole names; those that it evaluates or runs are not among them.
+#: rl_zoo3's options that a resume keeps, by their whole names. None is an option that rl_zoo3 evaluates or runs.
 _OPTIONS = (
     "log_folder", "tensorboard_log", "trained_agent", "n_timesteps", "num_threads", "log_interval", "eval_freq",
     "eval_episodes", "n_eval_envs", "save_freq", "save_replay_buffer", "vec_env", "device", "verbose", "progress",
 )  # fmt: skip
 #: Hyper-parameters that rl_zoo3 evaluates where they are text.
 EVALUATED = ("normalize", "monitor_kwargs", "policy_kwargs", "replay_buffer_class", "replay_buffer_kwargs")
-#: Hyper-parameters that name classes, which must be of these.
+#: Hyper-parameters that name classes, and what these must derive from.
 _NAMED: dict[str, type] = {"env_wrapper": gym.Wrapper, "vec_env_wrapper": VecEnvWrapper, "callback": BaseCallback}
 
 
@@ -75,8 +75,8 @@ class Record:
 
     @property
     def n_timesteps(self) -> int | None:
-        """The steps it was asked for on the command line, else by its hyper-parameters; None where neither says."""
-        given = self.options.get("n_timesteps") or -1  # rl_zoo3's, which leaves it to them
+        """The steps asked for on the command line, else in the hyper-parameters; None where neither says."""
+        given = self.options.get("n_timesteps") or -1  # rl_zoo3's -1: as the hyper-parameters say
         return given if given > 0 else self.hyperparams.get("n_timesteps")
 
     def task_words(self) -> list[str]:
@@ -94,7 +94,7 @@ class Record:
         return ["-i", agent] if agent else []
 
     def write(self, folder: Path) -> None:
-        """Write ``run.json`` into a folder; what it cannot hold is named in it."""
+        """Write ``run.json`` into a folder. The file names the settings that it cannot hold."""
         hyperparams, missing = {}, dict(self.missing)
         for name, value in self.hyperparams.items():
             try:
@@ -135,10 +135,10 @@ class Record:
             raise ValueError(f"{path} is damaged, or of another version of sb3_said: {error!r}.") from error
 
     def require(self, *names: str) -> None:
-        """Refuse to do without settings that the file could not hold.
+        """Refuse a run if its file could not hold a setting that is needed.
 
-        :param names: those that are needed
-        :raises ValueError: naming one that is missing
+        :param names: of the settings that are needed
+        :raises ValueError: for one that is missing
         """
         for name in names:
             if name in self.missing:
@@ -168,9 +168,9 @@ class Record:
         return words
 
     def check_hyperparams(self) -> None:
-        """Look at the hyper-parameters before rl_zoo3 does, which evaluates text and calls what has a name.
+        """Check the hyper-parameters before rl_zoo3 reads them: it evaluates text, and calls what a name stands for.
 
-        :raises ValueError: for text, and for a name that is no class of its kind
+        :raises ValueError: for text that would be evaluated, and for a name that is no class of its kind
         """
         for name in EVALUATED:
             if isinstance(self.hyperparams.get(name), str):
@@ -182,7 +182,7 @@ class Record:
 def evaluated(name: str, value: Any) -> str:
     """Write a hyper-parameter as the text that rl_zoo3 evaluates, such as ``{'activation_fn': th.nn.ReLU}``.
 
-    :raises ValueError: for one that it does not evaluate, and for what has no name there
+    :raises ValueError: for a hyper-parameter that rl_zoo3 does not evaluate, and for a value without a name there
     """
     if name not in EVALUATED:
         raise ValueError(f"{name} is {value!r:.100}, and rl_zoo3 evaluates no text of it.")
@@ -213,7 +213,7 @@ def options_of(args: argparse.Namespace) -> dict[str, Any]:
 def import_packages(names: Iterable[str]) -> None:
     """Import the modules that register a task.
 
-    :raises ImportError: for one that is not there, saying what to do
+    :raises ImportError: for a module that is not there; the message says what to do
     """
     for name in names:
         try:
@@ -227,7 +227,7 @@ def import_packages(names: Iterable[str]) -> None:
 
 
 def make_wrapper(wrappers: Any) -> Callable[[gym.Env], gym.Env] | None:
-    """Return what applies wrappers, from the task outwards.
+    """Return a function that applies wrappers, from the task outwards; None for no wrappers.
 
     :param wrappers: as rl_zoo3's ``env_wrapper``: a name, {name: arguments}, or a list of these
     :raises ValueError: for a name that is no ``gymnasium.Wrapper``
@@ -241,8 +241,8 @@ def with_delay(own: Any, delay: Delay, other: Delay = None) -> list[Any]:
     """Return rl_zoo3's ``env_wrapper`` with the delay around the user's own wrappers.
 
     :param own: as rl_zoo3's ``env_wrapper``
-    :param delay: None for no more than the user's
-    :param other: a delay that the length of the action history is to serve, too
+    :param delay: None adds no wrapper
+    :param other: another delay; the action history is long enough for both
     :raises ValueError: for a delay that ``own`` holds already
     """
     listed = list(own) if isinstance(own, list) else [own] if own else []
@@ -265,11 +265,11 @@ def is_delay_wrapper(name: Any) -> bool:
 
 
 def named_classes(given: Any, base: type) -> list[tuple[str, dict[str, Any]]]:
-    """Return names and arguments of classes, once each is known to be what it should be: a file may name any function.
+    """Return names and arguments of classes. Each class is checked: a file may name any function.
 
     :param given: a name, a class, {name: arguments}, or a list of these
-    :param base: that they must derive from
-    :raises ValueError: for others
+    :param base: what the classes must derive from
+    :raises ValueError: for anything else
     """
     found = []
     for name, kwargs in map(entry_of, given if isinstance(given, list) else [given]):

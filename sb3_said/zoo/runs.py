@@ -41,7 +41,7 @@ from sb3_said.zoo.folder import find_agent, find_normalization, resuming
 from sb3_said.zoo.record import ENDED_NAME, WRAPPER, Record, entry_of, import_packages, is_delay_wrapper, make_wrapper
 
 ANSWERS = get_args(Answer)
-DELAYS = {"delay", "max_delay", "state_history"}  # of the wrapper: what an agent plays under, and what it reads of it
+DELAYS = {"delay", "max_delay", "state_history"}  # of our wrapper: what an agent plays under, and what it reads
 
 
 @dataclass(frozen=True)
@@ -58,12 +58,12 @@ class LoadedRun:
     info: dict[str, Any]
     """what was loaded, in JSON types: algo, env, delay, file, trained_steps"""
     changes: dict[str, Any] = field(default_factory=dict)
-    """what its run changes in the task but the observation delay: arguments of ours, and those of other wrappers and of
-    ``gymnasium.make`` by their names"""
+    """what its run changes in the task besides the observation delay: other arguments of our wrapper, those of other
+    wrappers by the wrapper's name, and ``env_kwargs`` of ``gymnasium.make``"""
     statistics: Path | None = None
-    """file of what ``normalize`` does"""
+    """file of the statistics that ``normalize`` uses"""
     own_delay: DelayProcess | None = None
-    """of a task that is registered with one, and can be played under no other"""
+    """the delay that the task is registered with; it can be played under no other"""
 
     @property
     def setting(self) -> str:
@@ -72,7 +72,7 @@ class LoadedRun:
 
     @property
     def scored_task(self) -> str:
-        """The task, where D4RL's reference returns are of it; empty where the run changes it."""
+        """The task whose D4RL reference returns apply; empty where the run changes the task."""
         return "" if self.changes else str(self.info["env"])
 
     def play(
@@ -86,8 +86,8 @@ class LoadedRun:
     ) -> Rollout:
         """Play whole episodes, see :func:`~sb3_said.evaluation.rollout`.
 
-        :param age_error: control steps that the age is told wrong by, within what the agent was built for
-        :param answer: as of :func:`answering`; this one decides for the ``n_envs`` episodes at once
+        :param age_error: control steps by which the age is told wrong, within the ages that the agent was built for
+        :param answer: who answers, see :func:`answering`; decides for the ``n_envs`` episodes at once
         :raises ValueError: for an ``age_error`` where the agent is told no age, and for an answer that it does not have
         """
         if age_error and longest_delay(self.model) is None:
@@ -115,7 +115,7 @@ def load_run(
 ) -> LoadedRun:
     """Open a run.
 
-    Nothing in its files is run. What makes the task is: the installed modules that ``run.json`` names are imported.
+    No code in its files is run. To make the task, the installed modules that ``run.json`` names are imported.
 
     :param path: a run folder such as ``logs/said/Hopper-v5-delay4-seed1_1``, or an agent's ``.zip``
     :param algo: name of the algorithm, where neither a run folder nor the file says it
@@ -125,7 +125,7 @@ def load_run(
     :param device: torch device
     :param env_kwargs: more arguments for ``gymnasium.make``, such as ``render_mode``
     :param gym_packages: modules that register the task, beside those that the run remembers
-    :param answer: who is to play in a SAID agent, and so must know the delay; as the file says by default
+    :param answer: who is to play in a SAID agent, and is checked for the delay; by default as the file says
     :raises ImportError: for a module that is not there
     :raises ValueError: when the files do not say what to load, the agent does not fit the task, or the task cannot be
         made with these arguments
@@ -159,7 +159,7 @@ def load_run(
     wrap = make_wrapper(wrappers) or (lambda task: task)
 
     def make_env() -> gym.Env[Any, Any]:
-        return wrap(Monitor(make_task()))  # which counts the task's own rewards, below wrappers that change them
+        return wrap(Monitor(make_task()))  # below wrappers that change rewards, to count the task's own
 
     env = wrap(task)
     _check_spaces(model, env, file)
@@ -177,13 +177,15 @@ def load_run(
 
 
 def _algorithm_and_task(file: Path, record: Record | None, algo: str | None, env_id: str | None) -> tuple[str, str]:
-    """Return the algorithm and the task of an agent: what its run or its file says, and what is given where they don't.
+    """Return the algorithm and the task of an agent.
 
-    :raises ValueError: where nobody says it
+    The algorithm is what its run or its file says, else the given one. The task is the given one, else what they say.
+
+    :raises ValueError: where nobody says it, and for an algorithm that is not ours
     """
     own_algo, own_task = described(file) if record is None else (record.algo, record.env)
     unknown = [name for name in (own_algo or algo, algo or own_algo) if name not in ALGORITHMS]
-    if unknown:  # an agent of SB3 itself would run code of its file
+    if unknown:  # to load an agent of SB3 itself would run code in its file
         names = ", ".join(ALGORITHMS)
         told = f" ({unknown[0]})" if unknown[0] else ""
         raise ValueError(
@@ -199,7 +201,7 @@ def _algorithm_and_task(file: Path, record: Record | None, algo: str | None, env
 
 
 def _warn_if_unfinished(model: BaseAlgorithm, file: Path, record: Record | None) -> None:
-    is_last = record is not None and file.name == record.agent_name  # and no better one of amid the training
+    is_last = record is not None and file.name == record.agent_name  # and not the best one, saved during the training
     if not is_last or not isinstance(model, SAID) or model.planner_is_current or (file.parent / ENDED_NAME).is_file():
         return
     has_some = model.policy.planner_is_trained
@@ -224,10 +226,10 @@ def changes(env_kwargs: dict[str, Any], wrappers: list[Any]) -> dict[str, Any]:
 
 
 def described(file: Path) -> tuple[str | None, str | None]:
-    """Return the algorithm and the task that an agent's file names, as far as it does."""
+    """Return the algorithm and the task that an agent's file names, None for what it does not name."""
     try:
         metadata = load_metadata(file)
-    except SavedFileError:  # of SB3's own algorithms
+    except SavedFileError:  # a file of SB3's own algorithms
         return None, None
     names = [name for name, (kind, _) in ALGORITHMS.items() if kind.__name__ == metadata["kind"]]
     return (names[0] if len(names) == 1 else None), task_of(metadata)
@@ -239,9 +241,9 @@ def delay_name(process: DelayProcess) -> int | str:
 
 
 def answers(model: BaseAlgorithm) -> list[str | None]:
-    """Return who can answer in a SAID agent; None for another agent alone.
+    """Return who can answer in a SAID agent; ``[None]`` for another agent.
 
-    An expert that has learned nothing, as after learning from logs, answers only where there is nobody else.
+    An expert that has learned nothing, as in training from logs, answers only where there is nobody else.
     """
     if not isinstance(model, SAID):
         return [None]
@@ -251,7 +253,7 @@ def answers(model: BaseAlgorithm) -> list[str | None]:
 def answering(model: BaseAlgorithm, answer: str | None, at_once: bool = False) -> AbstractContextManager[Any]:
     """Let one of ``answers(model)`` answer inside the context; None leaves the model as it is.
 
-    :param at_once: as of :meth:`SAIDPolicy.answering`
+    :param at_once: see :meth:`SAIDPolicy.answering`
     :raises ValueError: for an answer that the model does not have
     """
     if answer is None:
@@ -288,7 +290,7 @@ def origin(run: LoadedRun) -> dict[str, Any]:
     return {
         "command": f"{program} {shlex.join(sys.argv[1:])}",
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        # Sums round otherwise with other instructions, such as AVX2 or AVX512: the same training then ends elsewhere
+        # With other instructions, AVX2 or AVX512, sums round differently, and the same training ends elsewhere
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} CPU cores, {get_cpu_capability()}",
         "device": str(getattr(run.model, "device", "cpu")),  # random actions have none
         "torch_threads": th.get_num_threads(),
@@ -297,7 +299,7 @@ def origin(run: LoadedRun) -> dict[str, Any]:
 
 
 def _process_of(env: gym.Env[Any, Any]) -> DelayProcess | None:
-    """Return the delays of a task that has some; an attribute of its own named ``process`` may be anything."""
+    """Return a task's delay process, None without. Only our wrapper is asked: another ``process`` may be anything."""
     wrapper = unwrap_wrapper(env, DelayedObservationWrapper)
     return wrapper.process if isinstance(wrapper, DelayedObservationWrapper) else None
 

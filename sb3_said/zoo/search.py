@@ -30,9 +30,9 @@ FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 
 
 class Stopped(BaseException):
-    """Ends a trial that did not finish, so that Optuna takes it for one that still runs.
+    """Ends an unfinished trial in such a way that Optuna believes that it still runs.
 
-    ``GridSampler`` tries the cell of such a trial again at the end, and that of a failed trial never.
+    ``GridSampler`` tries the cell of a running trial again at the end, but never that of a failed trial.
     """
 
 
@@ -58,21 +58,21 @@ def search(
     :param study: see ``open_study``
     :param tried: values of ``depth``, ``temperature``, ``sampling_steps`` and ``choice_factor``, or of some of them
     :param put: gives the agent such settings
-    :param play: returns what the agent earned, (n,), in n episodes from a reset seed on
+    :param play: takes a reset seed and n; returns what n episodes from that seed on earned, (n,)
     :param sampler: ``grid`` or ``tpe``
     :param n_trials: of the whole study, over all workers; as many as the grid has by default
     :param episodes: of a trial
     :param round_size: episodes between two looks at pruning
     :param seed: reset seed of the first episode
     :param timeout: seconds after which no trial is begun
-    :raises ValueError: where the agent earned what is not finite
+    :raises ValueError: where a return is not finite
     """
 
     def objective(trial: Trial) -> float:
         try:
             params = suggest(trial, tried, sampler)
             known = next((made for made in finished(study) if decisive(made.params) == decisive(params)), None)
-            if known is not None:  # of a smaller grid, in an earlier call, or of another choice where there is none
+            if known is not None:  # from an earlier, smaller grid, or temperature 0 with another factor
                 return repeat(trial, known)
             put(**params)
             return play_trial(trial, play, episodes, round_size, seed)
@@ -107,7 +107,7 @@ def suggest(trial: Trial, tried: dict[str, list[Any]], sampler: str) -> dict[str
             params[name] = trial.suggest_float(name, min(values), max(values))
         elif sampler == "tpe":
             params[name] = trial.suggest_categorical(name, values)
-        else:  # a range, which can grow with the grid; the choices of a category cannot
+        else:  # a range may grow with the grid; the choices of a category may not
             params[name] = trial.suggest_int(name, min(values), max(values))
     return params
 
@@ -132,14 +132,14 @@ def play_trial(
 ) -> float:
     """Report the episodes of a trial, and return their mean.
 
-    :raises TrialPruned: when it is worse than the best
+    :raises TrialPruned: when the trial is worse than the best
     """
     returns: list[float] = []
     is_pruned = False
     while len(returns) < episodes and not is_pruned:
         try:
             played = play(seed + len(returns), min(round_size, episodes - len(returns)))
-        except ValueError as error:  # Optuna is silent about the settings
+        except ValueError as error:  # Optuna itself does not tell the settings
             raise ValueError(f"With {describe(trial.params)}: {error}") from error
         for value in played:
             if not math.isfinite(value):
@@ -160,12 +160,12 @@ def open_study(
 ) -> optuna.Study:
     """Open a study, or begin it.
 
-    :param folder: shared by the workers, for a lock
+    :param folder: shared by the workers; holds their lock
     :param storage: an Optuna RDB URL, or the path of a journal file
-    :param name: of the study; by default the one of the folder's own file, whatever the run was named when it began
+    :param name: of the study; by default that of the study in the folder's own file, even if the run was renamed since
     :param settings: in JSON types, what all trials must have in common to be compared
     :param prune: p-value below which a trial is pruned; 0 prunes none
-    :param new_name: of a study that begins without a name
+    :param new_name: of a study that is begun without ``name``
     :raises ValueError: when the study was begun with other settings, or a data base cannot be opened
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -198,16 +198,16 @@ def _open_storage(storage: str) -> BaseStorage:
         finally:
             lock.release()
         return JournalStorage(JournalFileBackend(storage, lock))
-    # SQLite lets one worker write at a time, and tells the others that wait longer than this to give up.
+    # SQLite lets one worker write at a time. The others give up after these seconds.
     patience = {"connect_args": {"timeout": 120}} if storage.startswith("sqlite") else {}
     try:
         return RDBStorage(storage, engine_kwargs=patience)
-    except (SQLAlchemyError, RuntimeError) as error:  # the second where it is of another version of Optuna
+    except (SQLAlchemyError, RuntimeError) as error:  # RuntimeError: of another version of Optuna
         raise ValueError(f"--storage {storage} cannot be opened: {str(error).splitlines()[0]}") from error
 
 
 def _mend_journal(journal: Path) -> None:
-    """Remove what a full disk or a power cut has left of a last line, which the next one would be joined to.
+    """Remove a last line that a full disk or a power cut left incomplete: the next one would be joined to it.
 
     :raises ValueError: for a file of something else
     """
@@ -230,7 +230,7 @@ def finished(study: optuna.Study) -> list[FrozenTrial]:
 
 
 def find_winner(study: optuna.Study) -> FrozenTrial | None:
-    """Return the complete trial of the highest mean; of equals, that of the lowest settings, by name."""
+    """Return the complete trial of the highest mean; of equals, the one of the lowest settings, in order of names."""
     complete = [trial for trial in finished(study) if trial.state == TrialState.COMPLETE]
     return max(complete, key=lambda t: (t.value, *(-t.params[name] for name in sorted(t.params))), default=None)
 

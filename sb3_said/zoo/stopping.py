@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP as a wish, which a training grants where nothing is half done."""
+"""Ctrl-C, SIGTERM and SIGHUP ask a training to stop. It stops where nothing is half done."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if 
 
 
 class Stopping:
-    """Says whether the training has been asked to stop. A second wish is granted at once, as a ``KeyboardInterrupt``.
+    """Says whether the training has been asked to stop. A second signal raises ``KeyboardInterrupt`` at once.
 
     A signal that is ignored, as SIGHUP is under ``nohup``, stays ignored.
     """
@@ -27,10 +27,10 @@ class Stopping:
 
     @contextmanager
     def listening(self) -> Iterator[None]:
-        """Listen to the signals inside the context; outside the main thread nobody can.
+        """Listen to the signals inside the context; only the main thread can.
 
-        :raises KeyboardInterrupt: where the signal has ended the environments' processes, too, as one to a whole
-            process group does, before the training could stop
+        :raises KeyboardInterrupt: where a signal, such as one to the whole process group, ended the environments'
+            processes before the training could stop
         """
         before: dict[int, Any] = {}
         if threading.current_thread() is threading.main_thread():
@@ -62,7 +62,7 @@ class Stopping:
 
 @contextmanager
 def holding_back_ctrl_c() -> Iterator[None]:
-    """Let Ctrl-C wait until the end of the context, in the main thread; no other is interrupted."""
+    """Let Ctrl-C wait until the end of the context. It interrupts the main thread alone."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -77,12 +77,12 @@ def holding_back_ctrl_c() -> Iterator[None]:
 
 
 def shield() -> None:
-    """Let processes ignore Ctrl-C from their first step: a terminal sends it to all, also to those that are needed.
+    """Let child processes ignore Ctrl-C from their first step: a terminal sends it to all, even to those still needed.
 
-    They are forked from a server, and ignore what it has ignored since it began. Where there is none, as on Windows,
-    Ctrl-C ends them, too.
+    They are forked from a server, and ignore what the server has ignored since it began. Where there is no server, as
+    on Windows, Ctrl-C ends them, too.
     """
-    is_main = threading.current_thread() is threading.main_thread()  # no other may set what is ignored
+    is_main = threading.current_thread() is threading.main_thread()  # no other thread may set signals
     if not is_main or "forkserver" not in multiprocessing.get_all_start_methods():
         return
     from multiprocessing.forkserver import ensure_running

@@ -33,9 +33,9 @@ def make_table(cells: list[Cell], rows: Mapping[str, str]) -> Table:
 
 
 def unpaired(cells: list[Cell], rows: Mapping[str, str]) -> set[str]:
-    """Return the rows of which two delays share some of their training seeds and not all, by the names shown.
+    """Return the rows in which two delays share some training seeds but not all, by the names shown.
 
-    An average over delays would be of other seeds under each.
+    An average over the delays would mix different training seeds.
 
     :param rows: as of :func:`make_table`
     """
@@ -48,7 +48,7 @@ def unpaired(cells: list[Cell], rows: Mapping[str, str]) -> set[str]:
 
 
 def _by_seed(cells: list[Cell], rows: Mapping[str, str]) -> dict[str, dict[int | str, dict[str, list[float]]]]:
-    """Return the returns of each agent under each delay by what tells a training seed, in one order of these."""
+    """Return each agent's returns by delay and by the ``sha256`` that tells a training seed, in one order of these."""
     order = {sha256: i for i, sha256 in enumerate(dict.fromkeys(cell.sha256 for cell in cells))}
     played: dict[str, dict[int | str, dict[str, list[float]]]] = {agent: {} for agent in rows}
     for cell in sorted(cells, key=lambda cell: order[cell.sha256]):
@@ -61,13 +61,13 @@ class Manners(NamedTuple):
     """How an agent moves, over all that it played."""
 
     worst_tenth: float
-    """of its returns"""
+    """mean of the lowest tenth of its returns"""
     ended: float | None
-    """part of the episodes that the task ended; None where that was not counted, as the next"""
+    """part of the episodes that the task ended; None where that was not counted"""
     change: float | None
-    """of the actions, from step to step"""
+    """of the actions, from step to step; None where that was not measured"""
     succeeded: float | None
-    """part of the episodes that were a success; None of a task that does not tell it"""
+    """part of the episodes that were a success; None where the task does not tell it"""
 
 
 def manners_of(cells: Iterable[Cell]) -> Manners | None:
@@ -86,7 +86,7 @@ def manners_of(cells: Iterable[Cell]) -> Manners | None:
 
 
 def _part(played: list[dict[str, Any]], name: str) -> float | None:
-    """Return the part of all episodes that a count of each result is, over those results that have it."""
+    """Return which part of all episodes a count makes up, over the results that have this count."""
     counts = [(x, len(result["returns"])) for result in played if (x := result.get(name)) is not None]
     return sum(n for n, _ in counts) / sum(n for _, n in counts) if counts else None
 
@@ -128,7 +128,7 @@ def print_table(table: Table, delays: list[int | str], unpaired: Collection[str]
 
 
 def print_seeds(cells: Iterable[Cell], rows: Mapping[str, str]) -> None:
-    """Print the files behind each row that has several: those that were played under one label, in whichever call.
+    """Print the files behind each row that has several: one label may have been played in several calls.
 
     :param rows: as of :func:`make_table`
     """
@@ -150,7 +150,7 @@ def print_scores(table: Table, delays: list[int | str], env_id: str, unpaired: C
 
 
 def _columns(delays: list[int | str]) -> dict[str, list[int | str]]:
-    """Return the delays behind each column: each by itself, then those that an average is over."""
+    """Return the delays behind each column: first each delay by itself, then those of each average."""
     columns: dict[str, list[int | str]] = {str(delay): [delay] for delay in delays}
     for name, kind in (("mean of fixed", int), ("mean of random", str)):
         columns[name] = [delay for delay in delays if isinstance(delay, kind) and AGE not in str(delay)]
@@ -185,13 +185,13 @@ def average(
     interval: Callable[[Any], Interval] = confidence_interval,
     is_paired: bool = True,
 ) -> tuple[str, str]:
-    """Write the mean return over delays with its interval, and what that is over: training seeds, or reset seeds.
+    """Write the mean return over delays with its interval, and what the interval is over: training or reset seeds.
 
     :param row: of an agent
-    :param delays: those that the agent cannot play are left out, and the rest is counted. Delays of different numbers
-        of training seeds have a mean and no interval
+    :param delays: those that the agent cannot play are left out, and the text says how many are left. Delays of
+        different numbers of training seeds have a mean and no interval
     :param interval: of returns (n_episodes,), or (n_seeds, n_episodes) of several training seeds
-    :param is_paired: whether the delays have the same training seeds; else several have a mean and no interval, too
+    :param is_paired: whether the delays have the same training seeds; if not, several delays have no interval either
     """
     returns = [row[delay] for delay in delays if delay in row]
     if not returns:

@@ -58,8 +58,8 @@ def budget(word: str) -> int:
     return int(word)
 
 
-#: Options of rl_zoo3 that are read here first: paths, which a resume finds from anywhere, and what rl_zoo3 would take
-#: for another.
+#: Options of rl_zoo3 that are read here first: paths, so that a resume finds them from anywhere, and values that
+#: rl_zoo3 would misread.
 PASSED_ON: dict[tuple[str, ...], Callable[[str], Any]] = {
     ("-i", "--trained-agent"): os.path.abspath,
     ("-tb", "--tensorboard-log"): lambda word: word and os.path.abspath(word),  # "" is none; a resume finds the others
@@ -113,7 +113,7 @@ def main(argv: list[str] | None = None) -> None:
     argv = sys.argv[1:] if argv is None else argv
     with explained(parser):
         run, algo, zoo_argv = read_command_line(argv)
-    if run.resume is not None and len(argv) <= 2 and (run.resume / ENDED_NAME).is_file():  # nothing else is asked for
+    if run.resume is not None and len(argv) <= 2 and (run.resume / ENDED_NAME).is_file():  # --resume alone
         play = shlex.join(["sb3-said", "evaluate", str(run.resume)])
         print(f"{run.resume} has ended, and nothing is left to do. {play} plays its agent.")
         if algo == "said" and run.dataset:
@@ -140,8 +140,8 @@ def main(argv: list[str] | None = None) -> None:
         if made:
             raise
         mend = f": {TO_IMPORT}" * isinstance(error, ImportError)
-        parser.error(f"{error}{mend}")  # of the options that rl_zoo3 reads, some of which it evaluates
-    except KeyboardInterrupt:  # before or behind the training, which ends on its own
+        parser.error(f"{error}{mend}")  # from the options that rl_zoo3 reads or evaluates
+    except KeyboardInterrupt:  # before or after the training, which handles it itself
         parser.exit(130, "\nInterrupted.\n")
     finally:
         for manager in made:
@@ -153,7 +153,7 @@ def main(argv: list[str] | None = None) -> None:
 def read_command_line(argv: list[str]) -> tuple[Run, str, list[str]]:
     """Return what the command line adds to rl_zoo3's, the algorithm, and what is left for rl_zoo3.
 
-    :param argv: with ``--resume``, what changes in the command line that the run was started with
+    :param argv: with ``--resume``, only what changes in the command line that started the run
     :raises ValueError: for a folder without a run, a bad delay, an expert's delay without a planner, a dataset that the
         algorithm does not learn from or lacks, or a resume of another task
     """
@@ -164,7 +164,7 @@ def read_command_line(argv: list[str]) -> tuple[Run, str, list[str]]:
         zoo_argv += [] if value is None else [f"{name}={value}"]
     if options.num_threads != -1:
         check_positive(options, "num_threads")
-    if options.num_threads is not None or options.resume is None:  # whose own number stands before
+    if options.num_threads is not None or options.resume is None:  # else the run's own number holds
         zoo_argv.append(f"--num-threads={1 if options.num_threads is None else options.num_threads}")
     delay, expert_delay = read_delay(options.delay), read_delay(options.expert_delay)
     check_positive(options, "checkpoint_freq")
@@ -185,11 +185,11 @@ def read_command_line(argv: list[str]) -> tuple[Run, str, list[str]]:
     if expert_delay is not None and (algo != "said" or delay is None):
         raise ValueError("--expert-delay needs --algo said and a --delay: an agent without a planner is its expert.")
     check_dataset(algo, options.dataset, expert_delay)
-    # Four digits: they are in the folder's name. Evaluation and tuning take reset seeds from 10,000 on.
+    # Four digits are short enough for the folder's name. Evaluation and tuning take reset seeds from 10,000 on.
     seed = secrets.randbelow(10_000) if options.seed is None or options.seed < 0 else options.seed
     dataset = [os.path.abspath(source) if is_file(source) else source for source in options.dataset]
     run = Run(delay, options.preset or "cpu", options.checkpoint_freq, None, expert_delay, None, dataset)
-    module, _, env = (options.env or "Pendulum-v1").rpartition(":")  # Gymnasium's way to name whoever registers it
+    module, _, env = (options.env or "Pendulum-v1").rpartition(":")  # MODULE:TASK, where MODULE registers the task
     packages = ["--gym-packages", module] if module else []
     return run, algo, joined_settings([f"--env={env}", f"--seed={seed}", *zoo_argv, *packages])
 
@@ -220,10 +220,10 @@ def check_dataset(algo: str, dataset: list[str], expert_delay: Delay) -> None:
 
 
 def joined_settings(argv: list[str]) -> list[str]:
-    """Join the repeated uses of each option of KEY:VALUE words, and put it last.
+    """Join the repeated uses of each option that takes KEY:VALUE words, and put it last.
 
-    rl_zoo3 reads only the last use of an option, so a resume that changes one setting would drop the others. Of a key
-    given twice, it takes the later value.
+    rl_zoo3 reads only the last use of an option, so a resume that changes one setting would drop the others. If a key
+    is given twice, rl_zoo3 takes the later value.
 
     :raises ValueError: for a word without a colon
     """

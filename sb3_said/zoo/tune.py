@@ -1,4 +1,4 @@
-"""Search the planner's depth and how it decides for a trained SAID run, sharing its expert and replay."""
+"""Search the planner's depth, and how it decides, for a trained SAID run. All trials share its expert and replay."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def tune(args: argparse.Namespace) -> None:
         raise ValueError(
             f"{folder} is the folder of a run, whose {RECORD_NAME} would be replaced: give another --output."
         )
-    read_report(folder / RESULTS_NAME)  # what is no report is told now, and not after the trials
+    read_report(folder / RESULTS_NAME)  # refuse now a file that is no report, not after the trials
     dataset = Record.read(args.run).dataset
     planners = DepthPlanners(model, args.run / CHECKPOINT_NAME, folder, args.gradient_steps, args.progress, dataset)
     steps = args.sampling_steps or [planners.config.sampling_steps]
@@ -170,7 +170,7 @@ def tune(args: argparse.Namespace) -> None:
     how = {"sampler": args.sampler, "n_trials": args.n_trials, "round_size": args.round, "timeout": left}
     search(study, tried, planners.put, play, episodes=args.episodes, seed=args.seed, **how)
     with FileLock(folder / "report.lock"):
-        winner = find_winner(study)  # while nobody else reports one
+        winner = find_winner(study)  # under the lock nobody else reports one
         if winner is None:
             raise ValueError("No trial is finished, so there is no winner: give more --timeout or --n-trials.")
         planners.put(**winner.params)
@@ -199,7 +199,7 @@ def open_run(args: argparse.Namespace) -> tuple[LoadedRun, SAID]:
 
 
 def read_report(file: Path) -> dict[str, Any]:
-    """Return what an earlier call has reported, nothing where there was none.
+    """Return what an earlier call has reported, ``{}`` where there was none.
 
     :raises ValueError: for a file of something else
     """
@@ -217,7 +217,7 @@ def report(args: argparse.Namespace, run: LoadedRun, study: Study, winner: Froze
     fresh = {"study": study.study_name, "trial": winner.number, "finished": str(winner.datetime_complete)}
     fresh |= {"seed": args.report_seed, "n_episodes": args.report_episodes}
     before = read_report(results)
-    if fresh.items() <= before.items():  # by another worker, or an earlier call
+    if fresh.items() <= before.items():  # another worker has played it, or an earlier call
         played = before["results"]
     else:
         how = (args.report_episodes, args.report_seed)
@@ -230,7 +230,7 @@ def report(args: argparse.Namespace, run: LoadedRun, study: Study, winner: Froze
     trials = [trial_to_dict(trial) for trial in finished(study)]
     choice = f"{', '.join(winner.params)}: the best of {len(trials)} trials, mean return {winner.value:.1f} over "
     choice += f"{args.episodes} episodes; how the planner decides beyond that: as the run does"
-    assert isinstance(run.model, SAID)  # as open_run saw to
+    assert isinstance(run.model, SAID)  # open_run has seen to it
     decides = {name: getattr(run.model.policy.planner.config, name) for name in ("mask", *SAMPLING_SETTINGS)}
     n_updates = int(run.model.policy.planner_updates)
     command = write_best(args.run, folder, decides | winner.params, n_updates, choice)
