@@ -234,9 +234,7 @@ class SafeSaveMixin(Learner):
         nodes = {name: node for name, node in saved.items() if name not in given}
         check_numbers("arguments", nodes)
         arguments = {name: from_data(node) for name, node in nodes.items()}
-        policy_class = arguments.get("policy_class", cls.policy_aliases["MlpPolicy"])
-        for name, value in arguments.items():
-            cls._check_argument(name, value, policy_class)
+        cls._check_arguments(arguments, arguments)
         return arguments | given
 
     @classmethod
@@ -248,8 +246,14 @@ class SafeSaveMixin(Learner):
                 f"The given policy_kwargs {changes['policy_kwargs']} differ from {stored} in the file, which the saved"
                 " networks were built with. Leave them out of the call."
             )
-        for name, value in changes.items():
-            cls._check_argument(name, value, arguments.get("policy_class", cls.policy_aliases["MlpPolicy"]))
+        cls._check_arguments(changes, arguments)
+
+    @classmethod
+    def _check_arguments(cls, values: dict[str, Any], arguments: dict[str, Any]) -> None:
+        """:raises ValueError: for values that do not go with the constructor, or with the policy of the arguments"""
+        policy_class = arguments.get("policy_class", cls.policy_aliases["MlpPolicy"])
+        for name, value in values.items():
+            cls._check_argument(name, value, policy_class)
 
     @classmethod
     def _check_argument(cls, name: str, value: Any, policy_class: type) -> None:

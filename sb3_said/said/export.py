@@ -50,18 +50,19 @@ class Graph:
         """Add nodes that hold ``x`` between two constants."""
         return self.add("Max", self.add("Min", x, self.constant(high)), self.constant(low))
 
-    def model(self, name: str, inputs: dict[str, list[str | int]], outputs: dict[str, list[str | int]]) -> Any:
-        """Return what was added as a checked ``onnx.ModelProto``, whose inputs and outputs are float32.
+    def model(self, inputs: dict[str, list[str | int]], act_dim: int, metadata: dict[str, str]) -> Any:
+        """Return what was added as a checked ``onnx.ModelProto``, whose inputs and ``action`` (B, act_dim) are float32.
 
         :param inputs: shape of each input by its name; a text is an axis of any length
         """
         helper = self.onnx.helper
         tensors = (
             [helper.make_tensor_value_info(key, self.onnx.TensorProto.FLOAT, shape) for key, shape in part.items()]
-            for part in (inputs, outputs)
+            for part in (inputs, {"action": ["B", act_dim]})
         )
-        graph = helper.make_graph(self.nodes, name, *tensors, self.constants)
+        graph = helper.make_graph(self.nodes, "student", *tensors, self.constants)
         made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
+        helper.set_model_props(made, metadata)
         self.onnx.checker.check_model(made)
         return made
 
@@ -112,12 +113,10 @@ def to_onnx(model: SAID, normalization: VecNormalize | None = None) -> Any:
         "delay": ["B", 1],
     }
     inputs = {key: shapes[key] for key in (KEYS if student.reader is not None else KEYS[:1])}
-    made = graph.model("student", inputs, {"action": ["B", act_dim]})
     bounds = {"action_low": json.dumps(space.low.tolist()), "action_high": json.dumps(space.high.tolist())}
     bounds["action_dtype"] = str(space.dtype)
     told = {"max_delay": str(max_delay), "reads_normalized": json.dumps(model.reads_normalized and statistics is None)}
-    graph.onnx.helper.set_model_props(made, told | bounds)
-    return made
+    return graph.model(inputs, act_dim, told | bounds)
 
 
 def _read_delay(graph: Graph, max_delay: int) -> tuple[str, str]:
