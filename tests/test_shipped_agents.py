@@ -50,12 +50,12 @@ def test_one_is_drawn_beside_itself_ignoring_the_delay(tmp_path: Path, monkeypat
     """``make demo``, of the first steps of an episode."""
     imageio = pytest.importorskip("imageio.v3")
     need_a_renderer("Hopper-v5", monkeypatch)
-    monkeypatch.setattr(gym.spec("Hopper-v5"), "max_episode_steps", 25)
+    monkeypatch.setattr(gym.spec("Hopper-v5"), "max_episode_steps", 15)
     film = tmp_path / "film.gif"
     words = ["--delay", "8", "--beside-ignorant", "--size", "64", "--fps", "25", "--device", "cpu"]
     enjoy.main([str(FOLDER / "hopper.zip"), *words, "--record", str(film)])
     frames = imageio.imread(film)
-    assert frames.shape == (5, 64, 128, 3)  # 125 control steps a second
+    assert frames.shape == (3, 64, 128, 3)  # 125 control steps a second
     assert all(frame.std() > 10 for frame in frames)  # pictures, not blanks
     left, right = np.split(frames.astype(float), 2, axis=2)
     assert np.array_equal(left[0], right[0]) and not np.array_equal(left[-1], right[-1])  # one start, two ways on

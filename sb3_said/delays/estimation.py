@@ -171,8 +171,9 @@ def _held_out_gains(x: np.ndarray, y: np.ndarray, lagged: np.ndarray, fold: np.n
 
 def _residuals(x: np.ndarray, targets: list[np.ndarray], kept: np.ndarray) -> list[np.ndarray]:
     """Return each target's residual in a ridge regression on x, fitted to the rows kept."""
-    gram = x[kept].T @ x[kept] + np.eye(x.shape[1])
-    return [y - x @ np.linalg.solve(gram, x[kept].T @ y[kept]) for y in targets]
+    rows, y = x[kept], np.hstack(targets)
+    weights = np.linalg.solve(rows.T @ rows + np.eye(x.shape[1]), rows.T @ y[kept])
+    return np.split(y - x @ weights, np.cumsum([target.shape[1] for target in targets])[:-1], axis=1)
 
 
 def _check_episodes(observations: Sequence[np.ndarray], actions: Sequence[np.ndarray]) -> None:

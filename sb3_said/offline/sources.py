@@ -52,6 +52,7 @@ def read_file(path: Path, progress_bar: bool) -> Log:
     :param progress_bar: show one over the columns, where they take more than a second
     :raises FileNotFoundError: where there is no such file
     :raises ValueError: for a damaged file, or one without a column that is needed
+    :raises ImportError: for an HDF5 file without h5py
     """
     if not path.exists():
         raise FileNotFoundError(f"There is no dataset {path}.")

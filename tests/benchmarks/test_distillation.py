@@ -20,8 +20,15 @@ from sb3_said.zoo.runs import load_run
 TINY = {"n_labels": 40, "own_steps": 10, "rounds": 1, "gradient_steps": 5, "batch_size": 8}
 
 
-def test_students_are_played_beside_their_planner(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run, file = write_run(tmp_path / "run-v0", SAID, (0, 2), 90, checkpoint=True), tmp_path / "distillation.json"
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_run(tmp_path_factory.mktemp("runs") / "run-v0", SAID, (0, 2), checkpoint=True)
+
+
+def test_students_are_played_beside_their_planner(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "distillation.json"
     words = [str(run), "--settings", json.dumps(TINY), "--delays", "0", "2", "--episodes", "2", "--calls", "3",
              "--onnx", "--json", str(file)]  # fmt: skip
     rows = script.main([*words, "--seeds", "5"])
@@ -45,14 +52,14 @@ def test_students_are_played_beside_their_planner(tmp_path: Path, capsys: pytest
     assert "has rows of {" in capsys.readouterr().err
 
 
-def test_a_log_takes_the_replays_place(tmp_path: Path) -> None:
-    run, log, file = write_run(tmp_path / "run-v0", SAID, (0, 2), 90), tmp_path / "log.npz", tmp_path / "rows.json"
-    collect.main([str(run), "--steps", "60", "--n-envs", "1", "-o", str(log), "--device", "cpu"])
+def test_a_log_takes_the_replays_place(run: Path, tmp_path: Path) -> None:
+    log, file = tmp_path / "log.npz", tmp_path / "rows.json"
+    collect.main([str(run), "--steps", "70", "--n-envs", "1", "-o", str(log), "--device", "cpu"])
     words = [str(run), "--log", str(log), "--settings", json.dumps(TINY), "--delays", "0", "2", "--episodes", "1"]
     rows = script.main([*words, "--calls", "1", "--json", str(file)])
 
     model = script.open_with_log(run, log)
-    assert model.replay_buffer.size() == 60
+    assert model.replay_buffer.size() == 70
     model.seed = 1
     assert model.distill(**TINY) == rows["student, seed 1"]["error"]
     write_run(tmp_path / "expert-v0", DelayedSAC, 2)

@@ -19,14 +19,15 @@ def test_the_floor_counts_every_product_of_an_update(cls, delay):
     assert 2 * expert_updates.matmul_flops(model, 64) == counter.get_total_flops()
 
 
-def test_a_table_of_updates(tmp_path, capsys):
+def test_a_table_of_updates(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(expert_updates, "UPDATES_PER_TURN", 4)
     path = tmp_path / "updates.json"
     short = ["--steps", "150", "--rounds", "2", "--batch-size", "32", "--product-size", "64", "--product-seconds", "0"]
     rows = expert_updates.main([*short, "--delay", "2", "--json", str(path)])
     names = ["SB3's SAC", "DelayedSAC at delay 0", "DelayedSAC at delay 2", "StableSAC at delay 2"]
     assert [row["updates"] for row in rows] == names
     captured = capsys.readouterr()
-    assert captured.out.count("\n") == 2 + len(rows) and "2 turns of 20 updates" in captured.err
+    assert captured.out.count("\n") == 2 + len(rows) and "2 turns of 4 updates" in captured.err
     result = json.loads(path.read_text())
     assert result["rows"][0]["time, SAC's = 1"]["value"] == 1.0
     for row, kept in zip(rows, result["rows"], strict=True):

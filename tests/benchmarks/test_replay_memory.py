@@ -29,7 +29,7 @@ def test_both_buffers_return_the_same(monkeypatch):
 
 def test_memory_does_not_grow_with_the_delay(tmp_path):
     file = tmp_path / "figures.json"
-    rows = replay_memory.main(["--rows", "2000", "--rounds", "2", "--delay", "0", "16", "--json", str(file)])
+    rows = replay_memory.main(["--rows", "1000", "--rounds", "2", "--delay", "0", "16", "--json", str(file)])
     held = {(row["buffer"], row["delay"]): row["GB / 1 M"] for row in rows}
     assert held["ours", 16] == pytest.approx(held["ours", 0], rel=0.01)
     assert held["ours", 16] < 0.55

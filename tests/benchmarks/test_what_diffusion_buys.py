@@ -2,6 +2,7 @@
 
 import copy
 import json
+import shutil
 from argparse import Namespace
 from dataclasses import replace
 
@@ -27,7 +28,7 @@ def run(tmp_path_factory):
     """Return a run that was stopped before its planner was trained, as a checkpoint leaves it."""
     folder = tmp_path_factory.mktemp("runs") / f"{ENV}-delay0-2-seed0_1"
     env = DelayedObservationWrapper(gym.make(ENV), (0, 2))
-    kwargs = {"learning_starts": 50, "buffer_size": 500, "planner_kwargs": TINY_PLANNER, "planner_gradient_steps": 1}
+    kwargs = {"learning_starts": 80, "buffer_size": 500, "planner_kwargs": TINY_PLANNER, "planner_gradient_steps": 1}
     model = SAID("MlpPolicy", env, seed=0, device="cpu", planner_trial_episodes=0, **kwargs).learn(90)
     model.policy.planner_updates.zero_()
     save_tree(folder / "checkpoint.zip", training_state(model))
@@ -37,6 +38,12 @@ def run(tmp_path_factory):
     model.save(folder / "expert" / "best_model.zip")
     Record("said", ENV, 0, [0, 2]).write(folder)
     return folder
+
+
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory):
+    """Return a run of another seed that has ended."""
+    return write_run(tmp_path_factory.mktemp("runs") / "ended", SAID, (0, 2), 90, 1, True, learning_starts=80)
 
 
 def test_rows_are_played_by_whom_they_name(run, tmp_path, monkeypatch, capsys):
@@ -122,13 +129,12 @@ def test_other_settings_of_the_planner_need_another_file(run, tmp_path, monkeypa
     assert "--planner-kwargs takes NAME=VALUE" in capsys.readouterr().err
 
 
-def test_another_agent_needs_another_file(run, tmp_path, capsys):
+def test_another_agent_needs_another_file(run, ended, tmp_path, capsys):
     words = ["--updates", "3", "--delays", "2", "--episodes", "1", "--rows", "expert, average"]
     words += ["--json", str(tmp_path / "rows.json")]
     script.main([str(run), *words])
-    other = write_run(tmp_path / "other", SAID, (0, 2), 90, seed=1, checkpoint=True)
     with pytest.raises(SystemExit):
-        script.main([str(other), *words])
+        script.main([str(ended), *words])
     assert "holds results of {'actor':" in capsys.readouterr().err
 
 
@@ -139,8 +145,8 @@ def test_another_agent_needs_another_file(run, tmp_path, capsys):
         {"hyperparams": {"env_wrapper": {"gymnasium.wrappers.TimeLimit": {"max_episode_steps": 50}}}},
     ],
 )
-def test_a_task_that_is_not_made_here_is_refused(changed, tmp_path):
-    run = write_run(tmp_path / "run", SAID, (0, 2), 90, checkpoint=True)
+def test_a_task_that_is_not_made_here_is_refused(changed, ended, tmp_path):
+    run = shutil.copytree(ended, tmp_path / "run")
     assert script.open_run(run).num_timesteps == 90
     (run / "a-v5.normalize.zip").touch()  # is no agent
     replace(Record.read(run), **changed).write(run)

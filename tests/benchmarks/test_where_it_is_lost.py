@@ -28,8 +28,8 @@ def files(tmp_path_factory):
     """A planner that can be told states, an actor without delay, and a log."""
     folder = tmp_path_factory.mktemp("lost")
     kwargs = {"planner_kwargs": TINY_PLANNER | {"extra_state_probability": 0.5}, "planner_gradient_steps": 10}
-    said = write_run(folder / "said-v0", SAID, (0, 2), 90, **kwargs)
-    actor = write_run(folder / "actor-v0", DelayedSAC, 0, 60)
+    said = write_run(folder / "said-v0", SAID, (0, 2), **kwargs)
+    actor = write_run(folder / "actor-v0", DelayedSAC, 0)
     collect.main([str(said), "--steps", "80", "--n-envs", "1", "-o", str(folder / "log.npz"), "--device", "cpu"])
     return said, actor, folder / "log.npz"
 
@@ -68,7 +68,7 @@ def test_rows_of_a_run(files, tmp_path, capsys):
     assert script.main([*words, "--delays", "0", "2"]) == found
     assert {"command", "date", "machine", "versions"} < set(found["origin"])
     settings = {"dataset": [str(log)], "actor": str(actor), "episodes": 2, "eval_seed": 10_000, "seed": 0}
-    assert found["settings"] == {"run": str(said), "trained_steps": 90, **settings}
+    assert found["settings"] == {"run": str(said), "trained_steps": 60, **settings}
     with pytest.raises(SystemExit):  # rows of other episodes must not stand beside these
         script.main([*words, "--eval-seed", "5"])
     assert "and these would be of" in capsys.readouterr().err and json.loads(file.read_text()) == found

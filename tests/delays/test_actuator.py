@@ -95,21 +95,22 @@ def test_actions_that_take_a_time_each(observation, action, receiver, spare, see
         rng = np.random.default_rng([seed + episode, 1])
         there.reset(rng.spawn(1)[0])
         back.reset(rng)
-        sent, arrived_as = [], []  # arrived_as: which of those sent each step executed
+        sent, scaled, arrived_as = [], [], []  # arrived_as: which of those sent each step executed
         for t in range(1, task.length + 1):
             sent.append(env.action_space.sample())
+            scaled.append(scale_action(sent[-1], env.action_space))
             arrived_as.append(t - 1 - (there.step() if t > 1 else 0))
             obs, *_, info = env.step(sent[-1])
             for key, value in twin.step(sent[-1])[0].items():
                 np.testing.assert_array_equal(value, obs[key])  # one process says the same as two
             np.testing.assert_array_equal(task.actions[-1][-1], sent[arrived_as[-1]])
-            np.testing.assert_allclose(scale_action(task.actions[-1][-1], env.action_space), info["executed_action"])
+            np.testing.assert_allclose(scaled[arrived_as[-1]], info["executed_action"])
             shown = t - back.step()
             np.testing.assert_array_equal(obs["observation"], task.states[-1][shown])
             newest = max(arrived_as[:shown], default=-1)  # that shows in the observation
             assert obs["delay"].item() == t - 1 - newest <= process.max_delay
             n_sent = min(t, max_delay)
-            newest_sent = np.reshape([scale_action(a, env.action_space) for a in sent[t - n_sent :]], (n_sent, 2))
+            newest_sent = np.reshape(scaled[t - n_sent :], (n_sent, 2))
             np.testing.assert_allclose(obs["action_history"][max_delay - n_sent :], newest_sent)
             assert not obs["action_history"][: max_delay - n_sent].any()
             assert info["forced_deliveries"] == there.forced_deliveries + back.forced_deliveries

@@ -22,7 +22,7 @@ TASKS = ["Hopper-v5", "HalfCheetah-v5", "Walker2d-v5", "Ant-v5"]
 
 
 @functools.cache
-def play(name, noise, n_steps=2000, seed=0):
+def play(name, noise, n_steps, seed=0):
     """Episodes of true states (T + 1, obs_dim) and actions (T, act_dim); Ornstein-Uhlenbeck or uniform actions."""
     env, rng, episodes, left = gym.make(name), np.random.default_rng(seed), [], n_steps
     while left > 0:
@@ -57,8 +57,8 @@ def delayed(episodes, process, seed=0):
 @pytest.mark.parametrize("name", TASKS)
 @pytest.mark.filterwarnings("ignore:compiler attribute")
 def test_delays_of_four_tasks(name, noise):
-    episodes = play(name, noise)
-    for delay in (0, 1, 2, 4, 8, 12, 16) if name != "Ant-v5" else (0, 1, 8, 16):  # the slowest of them
+    episodes = play(name, noise, 1000)
+    for delay in (0, 1, 6, 16) if name != "Ant-v5" else (0, 1, 16):  # the slowest of them
         observations, actions, _ = delayed(episodes, FixedDelay(delay))
         found = estimate_delay(observations, actions)
         assert found.delay == delay and found.confidence >= 0.99
@@ -70,10 +70,9 @@ def test_delays_of_four_tasks(name, noise):
 @pytest.mark.parametrize("name", TASKS)
 @pytest.mark.filterwarnings("ignore:compiler attribute")
 def test_jitter_gives_the_most_frequent_age(name):
-    episodes = play(name, "uniform", 3000 if name == "Ant-v5" else 2000)  # of which a slow sensor shows a quarter
+    episodes = play(name, "uniform", 3000 if name == "Ant-v5" else 1500)  # of which a slow sensor shows a quarter
     for process, expected in [
         (WIFI_20MS, {2}),
-        (DroppedPackets(FixedDelay(4), p=0.1), {4}),
         (DroppedPackets(FixedDelay(4), p=0.3), {4}),
         (UniformDelay(4, 8), {4, 5, 6}),  # 21, 30 and 29 % of the ages
         (PeriodicPackets(FixedDelay(2), 4), {2, 5}),  # what the age is when a packet has come, or just before
@@ -116,7 +115,7 @@ def test_a_slow_sensor_of_positions(process):
 @pytest.mark.filterwarnings("ignore:compiler attribute")
 def test_positions_alone_suffice(delay):
     # velocities are not observed; without the newest step of the position, the action before would explain more
-    observations, actions, _ = delayed(play("Hopper-v5", "ou"), FixedDelay(delay))
+    observations, actions, _ = delayed(play("Hopper-v5", "ou", 1000), FixedDelay(delay))
     assert estimate_delay([o[:, :5] for o in observations], actions).delay == delay
 
 
@@ -126,7 +125,7 @@ def test_a_log_that_starts_amid_the_motion():
     episodes = [
         (states[: 100 - 7 + 1], actions[7:100])
         for k in range(0, 1000, 100)
-        for states, actions in [(play("HalfCheetah-v5", "ou")[0][0][k:], play("HalfCheetah-v5", "ou")[0][1][k:])]
+        for states, actions in [[log[k:] for log in play("HalfCheetah-v5", "ou", 1000)[0]]]
     ]
     found = estimate_delay(*zip(*episodes, strict=True))
     assert (found.delay, found.confidence) == (7, 1.0)
@@ -254,7 +253,7 @@ def test_bad_arguments_are_refused(kwargs):
 
 def test_a_delay_beyond_those_tried_is_warned_of():
     """Actions that resemble each other point at the largest age that is tried, and with full confidence."""
-    episodes = play("HalfCheetah-v5", "ou")
+    episodes = play("HalfCheetah-v5", "ou", 1000)
     late = delayed(episodes, FixedDelay(11))[:2]
     with pytest.warns(UserWarning, match=r"10, is the largest that was tried, and the true one may be larger"):
         found = estimate_delay(*late, max_delay=10)

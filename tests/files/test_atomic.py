@@ -3,6 +3,7 @@
 import errno
 import io
 import json
+import multiprocessing
 import os
 import pathlib
 import signal
@@ -10,9 +11,12 @@ import stat
 import subprocess
 import sys
 
+import numpy as np
 import pytest
+from forked import begin
 
 from sb3_said.files import atomic as files
+from sb3_said.files.archive import load_tree, save_tree
 from sb3_said.files.atomic import check_writable, remove_abandoned, replacing, write_json, write_text
 
 
@@ -60,37 +64,22 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
 
 
-# Three processes, each of which writes 1 MB of its own letter to one file, over and over. They are forked after the
-# imports, which take a second each, and so begin together.
-WRITERS = """
-import multiprocessing, sys
-import numpy as np
-from sb3_said.files.archive import load_tree, save_tree
-
-def write(letter):
+def write_and_read(path, letter, together):
+    """Write 1 MB of a letter to a file that others write too, over and over, and read it."""
+    together.wait(60)
     for _ in range(20):
-        save_tree(sys.argv[1], np.full(1_000_000, letter, np.uint8))
-        read = load_tree(sys.argv[1])
+        save_tree(path, np.full(1_000_000, letter, np.uint8))
+        read = load_tree(path)
         assert (read == read[0]).all()
-
-writers = [multiprocessing.get_context("fork").Process(target=write, args=(letter,)) for letter in b"abc"]
-for writer in writers:
-    writer.start()
-for writer in writers:
-    writer.join()
-sys.exit(str([writer.exitcode for writer in writers]) if any(writer.exitcode for writer in writers) else 0)
-"""
-
-
-def start(code, *words, **how):
-    root = pathlib.Path(files.__file__).parents[2]  # importable from there, installed or not
-    return subprocess.Popen([sys.executable, "-c", code, *map(str, words)], cwd=root, text=True, **how)
 
 
 def test_several_processes_may_write_one_file_and_a_reader_sees_it_whole(tmp_path):
-    path = tmp_path / "tree"
-    assert start(WRITERS, path).wait(120) == 0
-    assert list(tmp_path.iterdir()) == [path]
+    path, together = tmp_path / "files" / "tree", multiprocessing.get_context("forkserver").Barrier(3)
+    writers = [begin(tmp_path / f"{letter}.txt", write_and_read, path, letter, together) for letter in b"abc"]
+    for writer in writers:
+        writer.join()
+    assert [writer.exitcode for writer in writers] == [0, 0, 0]
+    assert list(path.parent.iterdir()) == [path]
 
 
 def test_the_last_to_finish_wins_however_long_it_took(tmp_path):
@@ -111,7 +100,9 @@ def test_what_a_killed_write_left_is_removed_by_the_next_one(tmp_path):
         "with replacing(sys.argv[1]):\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"
     )
-    assert start(code, path).wait(60) == -signal.SIGKILL
+    root = pathlib.Path(files.__file__).parents[2]  # importable from there, installed or not
+    killed = subprocess.run([sys.executable, "-c", code, str(path)], cwd=root, check=False)
+    assert killed.returncode == -signal.SIGKILL
     (left,) = tmp_path.iterdir()
     assert left.name.startswith(".run[1].zip.") and left.suffix == ".tmp"
     others = {tmp_path / name for name in (".run[1].zip.mine.tmp", ".run1.zip.0123abcd.tmp", ".run[1].zip.0123abcd")}

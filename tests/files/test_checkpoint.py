@@ -3,6 +3,8 @@
 import copy
 import errno
 import random
+import shutil
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -45,11 +47,15 @@ def normalized(n_envs=2):
 
 
 def make(env=None, cls=DelayedSAC, **kwargs):
-    arguments = {"learning_starts": 20, "batch_size": 16, "buffer_size": 300, "seed": 0, "device": "cpu"}
+    arguments = {"learning_starts": 30, "batch_size": 16, "buffer_size": 300, "seed": 0, "device": "cpu"}
     if cls is SAID:
-        arguments |= {"planner_kwargs": PLANNER, "planner_gradient_steps": 4, "planner_train_freq": 40}
+        arguments |= {"planner_kwargs": PLANNER, "planner_gradient_steps": 4, "planner_train_freq": 20}
+        arguments["planner_trial_episodes"] = 4
     env = delayed() if env is None else env
     return cls("MlpPolicy", env, **(arguments | {"policy_kwargs": {"net_arch": [16]}} | kwargs))
+
+
+collecting = partial(make, learning_starts=1000)  # makes no update
 
 
 def evaluation(folder, env=None):
@@ -57,7 +63,7 @@ def evaluation(folder, env=None):
     return EvalCallback(env, eval_freq=20, n_eval_episodes=2, log_path=str(folder / "evaluations"), verbose=0)
 
 
-def run_and_kill(model, folder, at=70, save_freq=50, callbacks=()):
+def run_and_kill(model, folder, at=52, save_freq=50, callbacks=()):
     with pytest.raises(Killed):
         model.learn(100, [*callbacks, TrainingCheckpointCallback(folder, save_freq), Kill(at)])
     return folder / CHECKPOINT_NAME
@@ -85,6 +91,17 @@ def assert_same(first, second):
         assert first == second
 
 
+@pytest.fixture(scope="module")
+def path_of_a_run(tmp_path_factory):
+    """The checkpoint of a run, which tests leave as it is; ``path`` is a copy."""
+    return run_and_kill(make(), tmp_path_factory.mktemp("run"))
+
+
+@pytest.fixture
+def path(path_of_a_run, tmp_path):
+    return shutil.copy(path_of_a_run, tmp_path / CHECKPOINT_NAME)
+
+
 # ---------------------------------------------------------------------------------------------------- resuming
 
 
@@ -95,7 +112,7 @@ def assert_same(first, second):
         (normalized, {"ent_coef": 0.2, "gradient_steps": 2}),
         (lambda: gym.make("Pendulum-v1", max_episode_steps=15), {"use_sde": True}),
         (delayed, {"cls": SAID}),
-        (normalized, {"cls": SAID, "buffer_size": 80}),
+        (normalized, {"cls": SAID, "buffer_size": 40}),
     ],
     ids=["DelayedSAC", "VecNormalize", "gSDE, plain", "SAID", "SAID, VecNormalize, full buffer"],
 )
@@ -103,12 +120,12 @@ def test_two_resumes_from_one_checkpoint_are_the_same(make_env, kwargs, tmp_path
     path = run_and_kill(make(make_env(), **kwargs), tmp_path)
     ends = []
     for noise in (1, 2):
-        np.random.seed(noise), th.manual_seed(noise), random.seed(noise)
         model = make(make_env(), **kwargs)
+        np.random.seed(noise), th.manual_seed(noise), random.seed(noise)
         restore_training(model, path)
         assert model.num_timesteps == 50
-        model.learn(50, reset_num_timesteps=False)
-        assert model.num_timesteps == 100 and model._total_timesteps == 100
+        model.learn(30, reset_num_timesteps=False)
+        assert model.num_timesteps == 80 and model._total_timesteps == 80
         ends.append((model, everything(model)))
     assert_same(ends[0][1], ends[1][1])
     assert ends[0][1]["counters"]["_n_updates"] > 0
@@ -127,7 +144,7 @@ def test_a_checkpoint_holds_the_whole_run(tmp_path):
         with pytest.raises(AssertionError):  # it was another model before
             assert_same(before[part], state[part])
     optimizer = resumed.actor.optimizer.state_dict()["state"]
-    assert optimizer[0]["step"] == resumed._n_updates == 25  # a rollout is a step of two environments
+    assert optimizer[0]["step"] == resumed._n_updates == 20  # a rollout is a step of two environments
     assert callback_again.evaluations_timesteps == callback.evaluations_timesteps == [40]
     assert_same(callback_again.evaluations_results, callback.evaluations_results)
     assert callback_again.best_mean_reward == callback.best_mean_reward > -np.inf
@@ -147,7 +164,7 @@ def test_a_run_that_was_stopped_at_once_has_no_checkpoint_before_it_is_written(t
 
 @pytest.mark.parametrize("name", ["observations", "actions", "rewards", "dones", "timeouts"])
 def test_any_number_of_a_replay_tells_it_from_another(name):
-    model = make().learn(40)
+    model = collecting().learn(40)
     before, column = checksum(model), getattr(model.replay_buffer, name)
     kept = column[39].copy()
     column[39] = 1 - kept
@@ -159,7 +176,7 @@ def test_any_number_of_a_replay_tells_it_from_another(name):
 
 def test_the_last_states_of_episodes_tell_replays_apart():
     """Values of what a time limit cut off are learned from them."""
-    model = make().learn(40)
+    model = collecting().learn(40)
     before, tails = checksum(model), model.replay_buffer.tails
     place, (state, age) = next(iter(tails.items()))
     tails[place] = state + 1, age
@@ -170,15 +187,12 @@ def test_the_last_states_of_episodes_tell_replays_apart():
     assert checksum(model) != before
 
 
-def test_a_resumed_environment_starts_a_new_episode(tmp_path):
-    model = make()
-    path = run_and_kill(model, tmp_path)
-    first = model.replay_buffer.observations[0, 0].copy()
-    starts = []
+def test_a_resumed_environment_starts_a_new_episode(path_of_a_run):
+    first, starts = load_tree(path_of_a_run)["replay_buffer"]["observations"][0, 0], []
     for seed in (0, 0, 1):
         resumed = make(seed=seed)
-        restore_training(resumed, path)
-        resumed.learn(20, reset_num_timesteps=False)
+        restore_training(resumed, path_of_a_run)
+        resumed.learn(2, reset_num_timesteps=False)
         buffer = resumed.replay_buffer
         assert buffer.steps[50, 0] == 0 and buffer.steps[51, 0] == 1
         starts.append(buffer.observations[50, 0])
@@ -189,9 +203,7 @@ def test_a_resumed_environment_starts_a_new_episode(tmp_path):
 @pytest.mark.parametrize("n_envs", [1, 2])
 def test_a_resumed_environment_meets_no_episode_of_another_use(tmp_path, n_envs):
     """Evaluation takes the seeds from 10000 on and tuning those from 20000 on: small numbers, as a user's own are."""
-    model = make(make_vec_env(delayed, n_envs=n_envs), seed=1)
-    path = run_and_kill(model, tmp_path)
-    seeds = []
+    path, seeds = run_and_kill(collecting(make_vec_env(delayed, n_envs=n_envs), seed=1), tmp_path), []
     for seed, steps in ((1, 50), (1, 50), (1, 9999), (51, 50), (50, 51)):
         state = load_tree(path)
         state["counters"]["num_timesteps"] = steps
@@ -213,12 +225,11 @@ def test_a_resume_amid_the_random_actions_repeats_none(tmp_path):
     assert len(np.unique(actions)) == 80
 
 
-def test_a_resume_starts_a_new_episode_in_a_model_that_was_amid_one(tmp_path):
-    path = run_and_kill(make(), tmp_path)
+def test_a_resume_starts_a_new_episode_in_a_model_that_was_amid_one(path_of_a_run):
     fresh, used = make(), make().learn(50)
     for model in (fresh, used):
-        restore_training(model, path)
-        model.learn(20, reset_num_timesteps=False)
+        restore_training(model, path_of_a_run)
+        model.learn(10, reset_num_timesteps=False)
     assert_same(everything(fresh), everything(used))
 
 
@@ -227,8 +238,8 @@ def test_a_resume_after_a_callback_has_ended_training_joins_no_two_episodes(tmp_
         def _on_step(self):
             return self.num_timesteps < 40
 
-    make().learn(100, [TrainingCheckpointCallback(tmp_path, 1000), Stop()])
-    model = make()
+    collecting().learn(100, [TrainingCheckpointCallback(tmp_path, 1000), Stop()])
+    model = collecting()
     restore_training(model, tmp_path / CHECKPOINT_NAME)
     buffer = model.replay_buffer
     assert (model.num_timesteps, buffer.size()) == (40, 39)  # SB3 does not store the last
@@ -248,7 +259,7 @@ def test_when_checkpoints_are_written(tmp_path, monkeypatch, n_envs, save_freq, 
         save_tree(path, state, metadata)
 
     monkeypatch.setattr(checkpoint, "save_tree", save)
-    model = make(make_vec_env(delayed, n_envs=n_envs)).learn(100, TrainingCheckpointCallback(tmp_path, save_freq))
+    model = collecting(make_vec_env(delayed, n_envs=n_envs)).learn(100, TrainingCheckpointCallback(tmp_path, save_freq))
     assert [counters["num_timesteps"] for _, counters in written] == expected
     assert {path for path, _ in written} == {tmp_path / CHECKPOINT_NAME}
     model.learn(0, TrainingCheckpointCallback(tmp_path, save_freq), reset_num_timesteps=False)
@@ -272,7 +283,7 @@ def test_checkpoints_are_spread_by_time_and_size(tmp_path, monkeypatch):
 
     monkeypatch.setattr(checkpoint, "save_tree", save)
     monkeypatch.setattr(checkpoint.time, "monotonic", lambda: now[0])
-    make().learn(60, [Clock(), TrainingCheckpointCallback(tmp_path)])
+    collecting().learn(60, [Clock(), TrainingCheckpointCallback(tmp_path)])
     assert written == [600, 1200, 1800, 3800, 5800, 6000]
 
 
@@ -283,12 +294,11 @@ def test_a_stop_is_granted_before_a_rollout(tmp_path):
         model.learn(100, callback)
     assert callback.save()
     counters = load_tree(tmp_path / CHECKPOINT_NAME)["counters"]
-    assert (counters["num_timesteps"], counters["_n_updates"]) == (40, 20)
+    assert (counters["num_timesteps"], counters["_n_updates"]) == (40, 10)
 
 
-def test_a_full_disk_ends_no_training(tmp_path, monkeypatch):
-    path, original = run_and_kill(make(), tmp_path), checkpoint.save_tree
-    before, full = path.read_bytes(), [True]
+def test_a_full_disk_ends_no_training(path, tmp_path, monkeypatch):
+    before, original, full = path.read_bytes(), checkpoint.save_tree, [True]
 
     def save(path, state, _):
         if full.pop() if full else False:
@@ -296,7 +306,7 @@ def test_a_full_disk_ends_no_training(tmp_path, monkeypatch):
         original(path, state)
 
     monkeypatch.setattr(checkpoint, "save_tree", save)
-    model = make()
+    model = collecting()
     callback = TrainingCheckpointCallback(tmp_path, 60)
     with pytest.warns(UserWarning, match=r"could not be written to .*checkpoint.zip .*No space left on device"):
         model.learn(61, callback)  # at 60 the disk is full, at the end there is room again
@@ -317,8 +327,8 @@ def test_a_full_disk_ends_no_training(tmp_path, monkeypatch):
         ("vec_normalize.*obs/observation", lambda model: model.env.obs_rms["observation"].mean.fill(np.nan)),
     ],
 )
-def test_no_checkpoint_is_written_that_nothing_could_go_on_from(where, spoil, tmp_path):
-    path = run_and_kill(make(normalized(1)), tmp_path)
+def test_no_checkpoint_is_written_that_nothing_could_go_on_from(where, spoil, forgeable, tmp_path):
+    path = shutil.copy(forgeable, tmp_path / CHECKPOINT_NAME)
     before = path.read_bytes()
     model, callback = make(normalized(1)), TrainingCheckpointCallback(tmp_path, 1000)
     callback.init_callback(model)
@@ -327,18 +337,17 @@ def test_no_checkpoint_is_written_that_nothing_could_go_on_from(where, spoil, tm
     with pytest.raises(ValueError, match=f"{where}.* is not finite. No checkpoint is written of it"):
         callback.save()
     assert path.read_bytes() == before
-    restore_training(make(normalized(1)), path)
+    restore_training(make(normalized(1)), path, evaluation(tmp_path))
 
 
 def test_a_checkpoint_has_every_step_and_its_updates(tmp_path):
-    make().learn(60, TrainingCheckpointCallback(tmp_path, 25))
+    make().learn(40, TrainingCheckpointCallback(tmp_path, 25))
     state = load_tree(tmp_path / CHECKPOINT_NAME)
-    assert len(state["replay_buffer"]["rewards"]) == state["counters"]["num_timesteps"] == 60
-    assert state["counters"]["_n_updates"] == 40
+    assert len(state["replay_buffer"]["rewards"]) == state["counters"]["num_timesteps"] == 40
+    assert state["counters"]["_n_updates"] == 10
 
 
-def test_being_killed_while_writing_leaves_the_last_checkpoint(tmp_path, monkeypatch):
-    path = run_and_kill(make(), tmp_path)
+def test_being_killed_while_writing_leaves_the_last_checkpoint(path, tmp_path, monkeypatch):
     before = path.read_bytes()
 
     def killed(*_, **__):
@@ -358,26 +367,22 @@ def test_evaluations_are_found_behind_a_progress_bar(tmp_path):
     assert again[0].evaluations_timesteps == [20, 40]
 
 
-def test_a_checkpoint_of_another_run_is_not_taken_for_this_one_s(tmp_path):
-    make(seed=0).learn(60, TrainingCheckpointCallback(tmp_path, 20))
-    callback = TrainingCheckpointCallback(tmp_path, 1000)
-    with pytest.raises(Killed):
-        make(seed=7).learn(60, [callback, Kill(30)])
-    assert load_tree(tmp_path / CHECKPOINT_NAME)["counters"]["num_timesteps"] == 0
+def test_a_checkpoint_of_another_run_is_not_taken_for_this_one_s(path, tmp_path):
+    run_and_kill(make(seed=7), tmp_path, at=30, save_freq=1000)
+    assert load_tree(path)["counters"]["num_timesteps"] == 0
 
 
-def test_nor_is_it_for_one_that_has_learned_before(tmp_path):
+def test_nor_is_it_for_one_that_has_learned_before(path, tmp_path):
     mine = make(seed=7).learn(40)
-    make(seed=0).learn(60, TrainingCheckpointCallback(tmp_path, 20))
     with pytest.raises(Killed):
-        mine.learn(60, [TrainingCheckpointCallback(tmp_path, 1000), Kill(70)], reset_num_timesteps=False)
+        mine.learn(60, [TrainingCheckpointCallback(tmp_path, 1000), Kill(45)], reset_num_timesteps=False)
     again = make(seed=7)
-    restore_training(again, tmp_path / CHECKPOINT_NAME)
+    restore_training(again, path)
     assert again.num_timesteps == 40
-    kept = (tmp_path / CHECKPOINT_NAME).read_bytes()
+    kept = path.read_bytes()
     with pytest.raises(Killed):  # and what it was restored from is not written again
-        again.learn(60, [TrainingCheckpointCallback(tmp_path, 1000), Kill(70)], reset_num_timesteps=False)
-    assert (tmp_path / CHECKPOINT_NAME).read_bytes() == kept
+        again.learn(60, [TrainingCheckpointCallback(tmp_path, 1000), Kill(45)], reset_num_timesteps=False)
+    assert path.read_bytes() == kept
 
 
 def test_the_patience_of_a_run_goes_on(tmp_path):
@@ -387,9 +392,9 @@ def test_the_patience_of_a_run_goes_on(tmp_path):
         evaluated = EvalCallback(task, callback_after_eval=stop, eval_freq=20, n_eval_episodes=1, verbose=0)
         return [evaluated, TrainingCheckpointCallback(folder)]
 
-    whole = make().learn(1000, callbacks(tmp_path))
-    make().learn(75, callbacks(tmp_path / "parts"))
-    again, others = make(), callbacks(tmp_path / "parts")
+    whole = collecting().learn(1000, callbacks(tmp_path))
+    collecting().learn(75, callbacks(tmp_path / "parts"))
+    again, others = collecting(), callbacks(tmp_path / "parts")
     restore_training(again, tmp_path / "parts" / CHECKPOINT_NAME, CallbackList(others))
     again.learn(925, others, reset_num_timesteps=False)
     assert again.num_timesteps == whole.num_timesteps == 100
@@ -413,7 +418,7 @@ def test_successes_go_on_where_they_were(is_late, tmp_path):
         return EvalCallback(Monitor(Told(delayed())), eval_freq=20, n_eval_episodes=2, log_path=tmp_path, verbose=0)
 
     before, after = evaluated(), evaluated()
-    model = make().learn(50, [before, TrainingCheckpointCallback(tmp_path, 30)])
+    model = collecting().learn(50, [before, TrainingCheckpointCallback(tmp_path, 30)])
     restore_training(model, tmp_path / CHECKPOINT_NAME, CallbackList([after, TrainingCheckpointCallback(tmp_path)]))
     assert after.evaluations_successes == before.evaluations_successes != []
     assert (len(before.evaluations_successes) < len(before.evaluations_results)) == is_late
@@ -430,7 +435,7 @@ def test_evaluations_within_another_event_go_on_as_well(tmp_path):
         return often, EveryNTimesteps(20, often)
 
     (before, event), (after, other) = evaluated(), evaluated()
-    model = make().learn(50, [event, TrainingCheckpointCallback(tmp_path, 30)])
+    model = collecting().learn(50, [event, TrainingCheckpointCallback(tmp_path, 30)])
     restore_training(model, tmp_path / CHECKPOINT_NAME, CallbackList([other, TrainingCheckpointCallback(tmp_path)]))
     assert after.evaluations_timesteps == before.evaluations_timesteps != []
     assert after.best_mean_reward == before.best_mean_reward
@@ -452,12 +457,20 @@ def test_the_planner_may_change_until_it_is_trained(tmp_path):
 @pytest.mark.parametrize(
     ("run", "resumed", "message"),
     [
-        (make, lambda: make(buffer_size=40), "does not fit a buffer"),
-        (make, lambda: make(policy_kwargs={"net_arch": [8]}), "'policy' does not fit: actor"),
-        (make, lambda: make(ent_coef=0.1), "unknown .'ent_coef_optimizer'"),
-        (make, lambda: make(normalized(1)), "normalised nothing, in this model's environment return, obs/observation;"),
-        (lambda: make(normalized(1)), make, "normalised return, obs/observation, in this model's environment nothing;"),
-        (make, lambda: make(cls=SAID), "'counters' does not fit: it lacks .'_planner_trained_at'"),
+        (collecting, lambda: make(buffer_size=40), "does not fit a buffer"),
+        (collecting, lambda: make(policy_kwargs={"net_arch": [8]}), "'policy' does not fit: actor"),
+        (collecting, lambda: make(ent_coef=0.1), "unknown .'ent_coef_optimizer'"),
+        (
+            collecting,
+            lambda: make(normalized(1)),
+            "normalised nothing, in this model's environment return, obs/observation;",
+        ),
+        (
+            lambda: collecting(normalized(1)),
+            make,
+            "normalised return, obs/observation, in this model's environment nothing;",
+        ),
+        (collecting, lambda: make(cls=SAID), "'counters' does not fit: it lacks .'_planner_trained_at'"),
     ],
 )
 def test_another_runs_checkpoint_is_refused(run, resumed, message, tmp_path):
@@ -467,7 +480,7 @@ def test_another_runs_checkpoint_is_refused(run, resumed, message, tmp_path):
 
 
 def test_evaluations_must_be_those_of_the_run(tmp_path):
-    path = run_and_kill(make(), tmp_path, callbacks=[evaluation(tmp_path)])
+    path = run_and_kill(collecting(), tmp_path, callbacks=[evaluation(tmp_path)])
     with pytest.raises(ValueError, match=r"had 1 EvalCallback and is resumed with 0"):
         restore_training(make(), path)
     longer = evaluation(tmp_path)
@@ -478,7 +491,7 @@ def test_evaluations_must_be_those_of_the_run(tmp_path):
 
 
 def test_a_replay_that_an_agent_begins_with_is_kept_at_once(tmp_path):
-    make().learn(60).save_replay_buffer(tmp_path / "replay_buffer.pkl")
+    collecting().learn(60).save_replay_buffer(tmp_path / "replay_buffer.pkl")
     model = make()
     model.load_replay_buffer(tmp_path / "replay_buffer.pkl")
     path = run_and_kill(model, tmp_path, at=1)

@@ -56,7 +56,7 @@ def learned():
     model = make()
     model.env.envs[0].step = None  # no environment is stepped, nor reset
     model.env.envs[0].reset = None
-    return model.learn_offline(demonstrations(), 600)
+    return model.learn_offline(demonstrations(), 200)
 
 
 def test_it_answers_with_the_action_of_the_hidden_present(learned):
@@ -192,7 +192,7 @@ def test_the_unit_of_a_state_does_not_matter(env):
             return replace(data, states=data.states * scale, finals=data.finals * scale)
 
         model = make(delayed(DELAY) if env == "delayed" else Drift(), **kwargs)
-        model.learn_offline(in_unit(demonstrations()), 150)
+        model.learn_offline(in_unit(demonstrations()), 100)
         model.take_dataset(in_unit(demonstrations(seed=1)))
         batch = model.replay_buffer.sample(1_000)
         with th.no_grad():
@@ -277,7 +277,7 @@ def test_it_is_saved_and_loaded(learned, tmp_path):
     np.testing.assert_array_equal(
         loaded.predict(obs, deterministic=True)[0], learned.predict(obs, deterministic=True)[0]
     )
-    assert loaded.num_timesteps == 600
+    assert loaded.num_timesteps == 200
 
 
 def test_each_update_is_a_rollout_that_begins_and_ends():

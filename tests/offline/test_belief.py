@@ -51,7 +51,7 @@ def source():
 def learned(request, source):
     th.manual_seed(0)
     belief = request.param(2, 1, DELAY)
-    train_belief(belief, source, 400)
+    train_belief(belief, source, 300, batch_size=64)
     return belief
 
 
@@ -222,8 +222,8 @@ def test_an_actor_of_ours_is_asked_at_age_0(state_history, recwarn):
 @pytest.mark.parametrize("actors_delay", [2, 5])
 def test_an_actor_of_two_is_asked_as_amid_the_episode(actors_delay):
     """No actions at all are how an episode begins, where the one of the largest age decides."""
-    actor = make(delayed(delay=(0, actors_delay)), planner_kwargs={"temperature": 0.0})
-    actor.learn(60)
+    actor = make(delayed(delay=(0, actors_delay)), planner_kwargs={"temperature": 0.0}, planner_gradient_steps=1)
+    actor.learn(30)
     actor.set_answer("both", expert_up_to=1)
     agent, obs = BeliefOnly(Truth(), actor), observe(env=delayed(delay=DELAY))
     found = agent.predict(obs, deterministic=True)[0]

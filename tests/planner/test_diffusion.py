@@ -147,8 +147,8 @@ def test_ddim_takes_the_steps_of_diffusers(schedule, prediction):
 @pytest.mark.parametrize("schedule", diffusion.SCHEDULES)
 @pytest.mark.parametrize("prediction", diffusion.PREDICTIONS)
 def test_gaussian_samples_have_the_right_mean_and_deviation(schedule, prediction):
-    noise = th.randn(20_000, 3, dtype=th.float64, generator=th.Generator().manual_seed(0))
-    samples = solve_gaussian(noise, 1000, schedule, prediction)
+    noise = th.special.ndtri((th.arange(1000, dtype=th.float64) + 0.5) / 1000)  # its quantiles
+    samples = solve_gaussian(noise[:, None].expand(-1, 3), 1000, schedule, prediction)
     assert ((samples.mean(0) - MEAN).abs() < 0.03 * STD + 0.003).all()
     th.testing.assert_close(samples.std(0), STD, rtol=0.04, atol=0.0)
 
@@ -156,7 +156,7 @@ def test_gaussian_samples_have_the_right_mean_and_deviation(schedule, prediction
 @pytest.mark.parametrize("schedule", diffusion.SCHEDULES)
 def test_convergence_is_of_first_order(schedule):
     x = th.linspace(-2, 2, 5, dtype=th.float64)[:, None].expand(-1, 3)
-    errors = [(solve_gaussian(x, n, schedule) - exact_gaussian(x, schedule)).abs().max().item() for n in (1000, 2000)]
+    errors = [(solve_gaussian(x, n, schedule) - exact_gaussian(x, schedule)).abs().max().item() for n in (250, 500)]
     assert errors[0] / errors[1] == pytest.approx(2, rel=0.1)
 
 

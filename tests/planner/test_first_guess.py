@@ -157,7 +157,7 @@ def test_older_steps_teach_the_model_and_not_the_clone():
     errors, clones = {}, {}
     for name, given_older in (("newest alone", None), ("both", older)):
         guess, generator = make_guess(), th.Generator().manual_seed(0)
-        fit_first_guess(guess, newest, normalizer, PlannerConfig(), 100, generator, D, older=given_older)
+        fit_first_guess(guess, newest, normalizer, PlannerConfig(), 70, generator, D, older=given_older)
         states, actions = (2 * th.rand(500, n, generator=generator) - 1 for n in (STATE_DIM, ACTION_DIM))
         with th.no_grad():
             z = normalizer.normalize_states(states)

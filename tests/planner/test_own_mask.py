@@ -39,7 +39,7 @@ def make_source() -> WindowSource:
     return WindowSource(states, actions[:, None], none, none.bool(), *starts, ages)
 
 
-def train(mask: str, source: WindowSource, n_steps: int = 200) -> PlannerTrainer:
+def train(mask: str, source: WindowSource, n_steps: int = 150) -> PlannerTrainer:
     with th.random.fork_rng(devices=[]):
         th.manual_seed(0)
         planner = InpaintingPlanner(1, 1, D, PlannerConfig(**{**QUICK, "mask": mask}))

@@ -77,7 +77,7 @@ def trainer() -> PlannerTrainer:
         small = PlannerConfig(
             depth=1, d_model=32, horizon=HORIZON, present="inpainted", precision="float32", weight_factor=0.0
         )
-        trainer = PlannerTrainer(InpaintingPlanner(STATE_DIM, ACTION_DIM, D, small), make_source(), gradient_steps=50)
+        trainer = PlannerTrainer(InpaintingPlanner(STATE_DIM, ACTION_DIM, D, small), make_source(), gradient_steps=30)
     trainer.make_first_guess()
     return trainer
 

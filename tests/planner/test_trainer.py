@@ -141,7 +141,7 @@ OTHER_SETTINGS = {
 
 def train_and_plan(**config):
     trainer = make_trainer(
-        **{"precision": "float32", "temperature": 1.0, "n_candidates": 16, "sampling_steps": 3, **config}
+        6, **{"precision": "float32", "temperature": 1.0, "n_candidates": 16, "sampling_steps": 3, **config}
     )
     trainer.train()
     generator = th.Generator().manual_seed(0)
@@ -505,7 +505,7 @@ def test_global_generator_is_neither_read_nor_moved():
 
 
 def test_errors_decrease():
-    trainer = make_trainer(gradient_steps=150, batch_size=64, ema_decay=0.9, learning_rate=3e-3)
+    trainer = make_trainer(gradient_steps=80, batch_size=64, ema_decay=0.9, learning_rate=3e-3)
     before = trainer.evaluate()
     trainer.train(20)
     first_loss = trainer.pop_losses()

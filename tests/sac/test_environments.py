@@ -62,7 +62,7 @@ class Steps(Drift):
 def test_whole_numbers_are_sent_stored_and_answered_as_they_are(cls, is_noisy, space):
     task = Steps(space)
     noise = NormalActionNoise(np.zeros(2), np.full(2, 0.3)) if is_noisy else None
-    model = make_agent(DelayedObservationWrapper(task, 2), cls, action_noise=noise, learning_starts=20).learn(45)
+    model = make_agent(DelayedObservationWrapper(task, 2), cls, action_noise=noise, learning_starts=35).learn(45)
     assert all(space.contains(action) for action in task.sent) and len(np.unique(task.sent)) > 3
     stored = model.replay_buffer._get_samples(np.arange(45))
     np.testing.assert_allclose(stored.actions, scale_action(np.array(task.sent), space), atol=1e-6)
@@ -135,7 +135,7 @@ UNFIT = {
 @pytest.mark.parametrize("unfit", UNFIT)
 def test_an_environment_that_does_not_fit_is_not_taken(unfit, tmp_path):
     make_env, message = UNFIT[unfit]
-    model = make().learn(30)
+    model = make().learn(10)
     before = model.env
     with pytest.raises(ValueError, match=message):
         model.set_env(make_env())

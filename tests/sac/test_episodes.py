@@ -74,7 +74,7 @@ def test_the_best_is_forgotten_where_nothing_returns_as_much_any_more():
 
 
 def test_training_counts_the_episodes_that_end():
-    model = make(Drift(length=7), cls=StableSAC).learn(90)
+    model = make(Drift(length=7), cls=StableSAC, learning_starts=1000).learn(90)
     episodes = model.policy.training_episodes
     returns = [info["r"] for info in model.ep_info_buffer]
     assert episodes.count == len(returns) == 12
@@ -94,12 +94,12 @@ def test_episodes_count_the_same_where_no_monitor_tells_of_them(n_envs, scales):
 
         env = DummyVecEnv([make_env] * n_envs)
         env = VecNormalize(env, norm_obs_keys=["observation"]) if scales else env
-        return make(env, cls=StableSAC).learn(150).policy.training_episodes
+        return make(env, cls=StableSAC, learning_starts=1000).learn(105).policy.training_episodes
 
     known, own = counted(Monitor), counted()
     inside = counted(Monitor, partial(TimeLimit, max_episode_steps=5))  # whose Monitor sees no end
     for found in (known, own, inside):
-        assert found.count == 150 // (5 if found is inside else 7) // n_envs * n_envs
+        assert found.count == 105 // (5 if found is inside else 7) // n_envs * n_envs
     for name, value in known.named_buffers():
         th.testing.assert_close(getattr(own, name), value, rtol=0, atol=1e-5)  # a Monitor rounds to 6 digits
     assert inside.newest.std() > 0
@@ -125,7 +125,7 @@ def test_the_average_waits_once_it_is_of_as_many_updates_as_it_remembers(decay, 
 
 
 def test_it_is_part_of_a_training_and_not_of_the_next(tmp_path):
-    model = make(delayed(2), cls=SAID).learn(60)
+    model = make(delayed(2), cls=SAID).learn(30)
     model.policy.training_episodes.load_state_dict(after(LEARNED + LOST).state_dict())
     model.save(tmp_path / "agent.zip")
     loaded = SAID.load(tmp_path / "agent.zip", env=delayed(2), device="cpu")
@@ -137,7 +137,7 @@ def test_it_is_part_of_a_training_and_not_of_the_next(tmp_path):
 
 
 def test_an_agent_of_before_they_were_counted_is_taken_over():
-    model, other = make(delayed(2), cls=SAID).learn(60), make(delayed(2), cls=SAID)
+    model, other = make(delayed(2), cls=SAID).learn(30), make(delayed(2), cls=SAID)
     given = model.get_parameters()
     given["policy"] = {name: x for name, x in given["policy"].items() if not name.startswith("training_episodes.")}
     other.set_parameters(given)

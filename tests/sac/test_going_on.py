@@ -123,7 +123,7 @@ def test_a_callback_may_play_the_environment_after_a_step(make_env, cls, monkeyp
                     env.step(np.array([env.action_space.sample()]))
             return True
 
-    model = make(make_env(), cls=cls)
+    model = make(make_env(), cls=cls, learning_starts=100)
     rows = record(model, monkeypatch)
     model.learn(70, callback=Play())
     assert model.num_timesteps == 70 and len(rows) == 70 - 4  # whose observations are gone
@@ -139,7 +139,7 @@ def normalized():
 )
 @pytest.mark.parametrize("n_episodes", [1, 2])
 def test_the_environment_may_be_played_between_two_calls(make_env, n_episodes, monkeypatch):
-    model = make(make_env())
+    model = make(make_env(), learning_starts=100)
     rows = record(model, monkeypatch)
     model.learn(25)
     evaluate_policy(model, model.get_env(), n_episodes, warn=False)

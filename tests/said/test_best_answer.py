@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from small_agent import answer, make, observe
-from small_task import pendulum
+from small_task import delayed, pendulum
 from stable_baselines3.common.logger import configure
 
 from sb3_said import SAID, DelayedObservationWrapper
@@ -26,7 +26,7 @@ def test_who_was_given_up_is_not_chosen(monkeypatch):
     played = {"a": np.array([9.0]), "planner": np.array([1.0, 2.0]), "b": np.array([3.0, 4.0]), "expert": np.zeros(2)}
     monkeypatch.setattr(trial, "play_trial", lambda *_: trial.Trial(played, np.full(2, 2.0), 7))
     ways = {"a": {"sampling_steps": 1}, "b": {"sampling_steps": 4}}
-    model = make(planner_trial_episodes=2, planner_ways=ways).learn(60)
+    model = make(planner_trial_episodes=2, planner_ways=ways).learn(25)
     assert model.policy.who_answers == "planner" and model.policy.planner.config.sampling_steps == 4
 
 
@@ -39,7 +39,7 @@ def test_the_planner_decides_in_its_best_way_whoever_answers(means, answers, mon
         warnings.simplefilter("ignore")
         model = make(planner_trial_episodes=2, planner_ways=ways)
         model.set_logger(configure(str(tmp_path), ["csv", "tensorboard"]))
-        model.learn(60)
+        model.learn(25)
     assert model.policy.who_answers == answers
     config = model.policy.planner.config
     rows = list(csv.DictReader((tmp_path / "progress.csv").open()))
@@ -59,7 +59,7 @@ def test_of_ways_that_the_trial_cannot_tell_apart_the_first_is_taken(monkeypatch
         returns = {name: played[name] for name in (*order, "planner", "expert")}  # as `play_trial` has them
         monkeypatch.setattr(trial, "play_trial", lambda *_, given=returns: trial.Trial(given, np.full(4, 2.0), 7))
         model = make(planner_trial_episodes=2, planner_ways={name: ways[name] for name in order})
-        chosen.append(model.learn(60).planner_kwargs)
+        chosen.append(model.learn(25).planner_kwargs)
     assert [settings["n_candidates"] for settings in chosen] == [6, 7]
 
 
@@ -81,7 +81,7 @@ def test_the_best_share_is_that_of_all(rows):
 
 def test_ties_are_broken_in_the_same_order_again_and_again():
     """Drift pays everyone alike. A way that the agent decides in already stands where it stood."""
-    model = make(planner_trial_episodes=2, planner_ways=WAYS).learn(60)
+    model = make(delayed(length=5), planner_trial_episodes=2, planner_ways=WAYS, planner_gradient_steps=1).learn(25)
     for _ in range(2):
         config = model.policy.planner.config
         assert (config.temperature, config.sampling_steps, config.choice_factor) == (1.0, 2, 1.0)  # "weighed"
@@ -110,7 +110,7 @@ def test_a_share_by_chance_is_none(monkeypatch):
     found = trial.Trial(returns, np.array([0.0, 2.0, 0.0, 2.0]), 7)
     assert trial.best_share(*returns.values(), found.ages)[1:] == (1.0, True)
     monkeypatch.setattr(trial, "play_trial", lambda *_: found)
-    model = make(env=pendulum(delay=(0, 2)), planner_trial_episodes=2).learn(60)
+    model = make(env=pendulum(delay=(0, 2)), planner_trial_episodes=2).learn(25)
     assert model.policy.who_answers == "planner"
 
 
@@ -122,7 +122,7 @@ def test_both_answer_where_each_does_better(age, expert_ages, monkeypatch, tmp_p
     monkeypatch.setattr(trial, "play_trial", lambda *_: found)
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message="The planner is worse than its expert")
-        model = make(env=pendulum(delay=(0, 2)), planner_trial_episodes=2).learn(60)
+        model = make(env=pendulum(delay=(0, 2)), planner_trial_episodes=2).learn(25)
     assert model.policy.who_answers == "both" and model.policy.expert_ages == expert_ages
     model.save(tmp_path / "agent.zip")
     loaded = SAID.load(tmp_path / "agent.zip", device="cpu")
@@ -135,7 +135,7 @@ def test_the_better_one_answers_also_after_saving(better, monkeypatch, tmp_path)
     rigged(monkeypatch, planner=[0.0, 3.0] if better == "planner" else [0.0, 1.0], expert=[1.0, 1.0])
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        model = make(planner_trial_episodes=2).learn(60)
+        model = make(planner_trial_episodes=2).learn(25)
     worse = [str(w.message) for w in caught if "worse than its expert" in str(w.message)]
     assert len(worse) == (better == "expert")
     assert model.policy.who_answers == better
@@ -151,7 +151,7 @@ def test_the_better_one_answers_also_after_saving(better, monkeypatch, tmp_path)
 def test_a_new_training_gives_the_planner_another_chance(monkeypatch):
     rigged(monkeypatch, planner=[0.0], expert=[1.0])
     with pytest.warns(UserWarning, match="worse than its expert"):
-        model = make(planner_trial_episodes=1).learn(60)
+        model = make(planner_trial_episodes=1).learn(25)
     rigged(monkeypatch, planner=[1.0], expert=[0.0])
     model.train_planner()
     assert model.policy.who_answers == "planner"
@@ -159,22 +159,22 @@ def test_a_new_training_gives_the_planner_another_chance(monkeypatch):
 
 def test_an_expert_without_updates_is_not_tried(monkeypatch):
     monkeypatch.setattr(trial, "play_trial", lambda *_: pytest.fail("played"))
-    told = r"random actions, which the newest 60 steps are: .* learning_starts=1000 of them\. Learn for longer\."
+    told = r"random actions, which the newest 10 steps are: .* learning_starts=1000 of them\. Learn for longer\."
     with pytest.warns(UserWarning, match=told):
-        model = make(env=pendulum(), planner_trial_episodes=2, learning_starts=1000).learn(60)
+        model = make(env=pendulum(), planner_trial_episodes=2, learning_starts=1000).learn(10)
     assert model.policy.who_answers == "planner"
 
 
 def test_no_trial_waits_for_the_end_of_episodes_that_do_not_end():
     env = DelayedObservationWrapper(gym.make("Pendulum-v1", max_episode_steps=-1), 2)
     with pytest.warns(UserWarning, match="No episode has ended"):
-        model = make(env=env, planner_trial_episodes=2).learn(60)
+        model = make(env=env, planner_trial_episodes=2).learn(25)
     assert model.policy.who_answers == "planner"
 
 
-def test_no_episodes_and_no_environment_leave_the_planner(trained, monkeypatch):
+def test_no_episodes_and_no_environment_leave_the_planner(monkeypatch):
     monkeypatch.setattr(trial, "play_trial", lambda *_: pytest.fail("played"))
-    model = make(planner_trial_episodes=0).learn(60)
+    model = make(planner_trial_episodes=0).learn(25)
     assert model.policy.who_answers == "planner"
     model.planner_trial_episodes, model.env = 3, None
     model.train_planner()
@@ -185,13 +185,13 @@ def test_only_the_last_training_of_many_is_tried(monkeypatch):
     """While collection goes on its episode must not be cut."""
     calls, played = [], trial.Trial({"planner": np.ones(1), "expert": np.zeros(1)}, np.full(1, 2.0), 7)
     monkeypatch.setattr(trial, "play_trial", lambda *args: calls.append(args) or played)
-    make(planner_trial_episodes=1, planner_train_freq=20).learn(60)
+    make(planner_trial_episodes=1, planner_train_freq=10, learning_starts=5).learn(25)
     assert len(calls) == 1
 
 
 def test_returns_and_steps_are_logged_behind_the_planners_rows(monkeypatch, tmp_path):
     rigged(monkeypatch, planner=[1.0, 3.0], expert=[1.0, 1.0])
-    model = make(planner_trial_episodes=2).learn(60)
+    model = make(planner_trial_episodes=2).learn(25)
     model.set_logger(configure(str(tmp_path), ["csv"]))
     model.logger.record("mine", 7)
     model.train_planner()

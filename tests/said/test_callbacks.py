@@ -27,7 +27,7 @@ PLANNER = {"d_model": 32, "depth": 1, "horizon": 3, "batch_size": 16, "sampling_
 
 def make(**kwargs):
     env = DelayedObservationWrapper(gym.make("Pendulum-v1", max_episode_steps=15), 2)
-    arguments = {"learning_starts": 20, "batch_size": 16, "buffer_size": 500, "seed": 0, "device": "cpu"}
+    arguments = {"learning_starts": 5, "batch_size": 16, "buffer_size": 500, "seed": 0, "device": "cpu"}
     arguments |= {
         "policy_kwargs": {"net_arch": [16]},
         "planner_kwargs": PLANNER,
@@ -84,12 +84,11 @@ def begun(trainings):
 
 @pytest.mark.parametrize("is_worse", [False, True])
 def test_a_planner_worse_than_the_regression_is_not_called_done(is_worse, monkeypatch):
-    model = make().learn(60)
     errors = {"planner/present_error_d2": 1.0 + is_worse, "planner/present_error_mlp_d2": 1.0}
     monkeypatch.setattr(PlannerTrainer, "evaluate", lambda self: errors)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        model.train_planner()
+        make().learn(15)
     told = [str(w.message) for w in caught if "worse than a small regression" in str(w.message)]
     assert len(told) == is_worse and all("present_error_d2 2 against 1" in message for message in told)
 
@@ -111,52 +110,52 @@ def interrupt_at(monkeypatch, update, error):
 
 
 @pytest.mark.parametrize(
-    ("planner_train_freq", "expected"), [(None, [100]), (40, [40, 80, 100]), (50, [50, 100]), (300, [100])]
+    ("planner_train_freq", "expected"), [(None, [20]), (8, [8, 16, 20]), (10, [10, 20]), (60, [20])]
 )
 def test_when_the_planner_is_trained(trainings, planner_train_freq, expected):
-    model = make(planner_train_freq=planner_train_freq).learn(100)
+    model = make(planner_train_freq=planner_train_freq, planner_gradient_steps=2).learn(20)
     assert begun(trainings) == expected
-    assert list(trainings.values()) == [6] * len(expected)
-    assert model.policy.planner_updates == 6
+    assert list(trainings.values()) == [2] * len(expected)
+    assert model.policy.planner_updates == 2
 
 
 @pytest.mark.parametrize("gamma", [0.9, 1.0])
 def test_before_the_expert_has_learned_no_planner_imitates_random_actions(trainings, gamma):
-    make(planner_train_freq=10, gamma=gamma).learn(45)  # learning_starts is 20
-    assert begun(trainings) == [21, 30, 40, 45]
+    make(planner_train_freq=5, gamma=gamma, planner_gradient_steps=1).learn(12)  # learning_starts is 5
+    assert begun(trainings) == [6, 10, 12]
 
 
 def test_learning_on_and_counting_anew(trainings):
-    model = make(planner_train_freq=40, buffer_size=200).learn(70)
-    assert begun(trainings) == [40, 70]
-    model.learn(30, reset_num_timesteps=False)
-    assert begun(trainings)[2:] == [80, 100]
+    model = make(planner_train_freq=10, planner_gradient_steps=1).learn(17)
+    assert begun(trainings) == [10, 17]
+    model.learn(8, reset_num_timesteps=False)
+    assert begun(trainings)[2:] == [20, 25]
     model.learn(0, reset_num_timesteps=False)
     assert len(trainings) == 4
-    model.learn(50)  # steps 0 to 50 again, on top of the 100 stored
-    assert begun(trainings)[4:] == [140, 150]
+    model.learn(13)  # steps 0 to 13 again, on top of the 25 stored
+    assert begun(trainings)[4:] == [35, 38]
 
 
 def test_a_second_learn_begins_with_random_actions_and_says_so_where_it_ends_there(trainings):
-    model = make(planner_train_freq=10).learn(40)
+    model = make(planner_train_freq=3, planner_gradient_steps=1).learn(7)
     trainings.clear()
-    with pytest.warns(UserWarning, match="random actions, which the newest 15 steps are: .* reset_num_timesteps=False"):
-        model.learn(15)
-    assert begun(trainings) == [55]  # rows stored
+    with pytest.warns(UserWarning, match="random actions, which the newest 4 steps are: .* reset_num_timesteps=False"):
+        model.learn(4)
+    assert begun(trainings) == [11]  # rows stored
 
 
 def test_an_agent_that_was_saved_amid_learning_collects_before_its_planner_is_trained(trainings, tmp_path):
-    make(planner_train_freq=30).learn(65, CheckpointCallback(30, str(tmp_path)))
+    make(planner_train_freq=8, planner_gradient_steps=1).learn(17, CheckpointCallback(8, str(tmp_path)))
     trainings.clear()
-    loaded = SAID.load(tmp_path / "rl_model_60_steps.zip", env=make().env, device="cpu")
-    loaded.learn(15, reset_num_timesteps=False)
-    assert begun(trainings) == [1, 15] and loaded.num_timesteps == 75
+    loaded = SAID.load(tmp_path / "rl_model_16_steps.zip", env=make().env, device="cpu")
+    loaded.learn(5, reset_num_timesteps=False)
+    assert begun(trainings) == [1, 5] and loaded.num_timesteps == 21
 
 
 def test_a_callback_of_the_users_is_the_one_that_trains(trainings, tmp_path):
     mine = PlannerTrainingCallback(folder=tmp_path)
-    make().learn(40, CallbackList([CallbackList([mine])]))
-    assert begun(trainings) == [40] and (tmp_path / PLANNER_CHECKPOINT_NAME).exists()
+    make().learn(15, CallbackList([CallbackList([mine])]))
+    assert begun(trainings) == [15] and (tmp_path / PLANNER_CHECKPOINT_NAME).exists()
     mine.on_training_end()  # some callers end a training twice
     assert len(trainings) == 1
 
@@ -170,7 +169,7 @@ class Stopping(CallbackList):
 
     def _on_step(self):
         self.seen.append((self.locals["num_collected_steps"], self.model.num_timesteps, self.callbacks[0].n_calls))
-        return super()._on_step() and self.num_timesteps < 25
+        return super()._on_step() and self.num_timesteps < 8
 
 
 class Child(BaseCallback):
@@ -182,9 +181,9 @@ class Child(BaseCallback):
 @pytest.mark.parametrize("trains_itself", [False, True])
 def test_a_list_of_the_users_own_is_asked_as_a_whole(trainings, trains_itself, progress_bar):
     own = Stopping([Child()] + [PlannerTrainingCallback()] * trains_itself)
-    model = make().learn(60, own, progress_bar=progress_bar)
-    assert model.num_timesteps == 25  # it was asked, and ended training
-    assert own.seen == [(1, t, t - 1) for t in range(1, 26)] and own.locals["self"] is model
+    model = make().learn(20, own, progress_bar=progress_bar)
+    assert model.num_timesteps == 8  # it was asked, and ended training
+    assert own.seen == [(1, t, t - 1) for t in range(1, 9)] and own.locals["self"] is model
     assert len(trainings) == 1
 
 
@@ -198,15 +197,15 @@ def test_every_form_of_callbacks_that_sb3_takes(trainings, form):
 
     child = Child()
     forms = {"list": [child], "tuple": (child,), "function": ask, "callback": child, "none": None}
-    model = make().learn(30, forms[form])
+    model = make().learn(10, forms[form])
     assert asked == ([*range(1, 8)] if form == "function" else [])
-    assert child.n_calls == (30 if form in ("list", "tuple", "callback") else 0)
-    assert begun(trainings) == [6 if form == "function" else 30] and model.policy.planner_is_trained
+    assert child.n_calls == (10 if form in ("list", "tuple", "callback") else 0)
+    assert begun(trainings) == [6 if form == "function" else 10] and model.policy.planner_is_trained
 
 
 def test_no_network_lives_in_the_callback():
     callback = PlannerTrainingCallback()
-    model = make().learn(40, callback)
+    model = make().learn(15, callback)
 
     def holds_tensors(value):
         return isinstance(value, (th.nn.Module, th.Tensor, th.optim.Optimizer, PlannerTrainer))
@@ -221,26 +220,26 @@ def test_no_network_lives_in_the_callback():
 
 def test_losses_are_logged_and_a_bar_is_shown(capsys):
     memory = Memory()
-    model = make(planner_gradient_steps=5)
+    model = make(planner_gradient_steps=5, learning_starts=50)
     model.set_logger(Logger(None, [memory]))
-    model.learn(80, PlannerTrainingCallback(log_interval=2, eval_interval=4, progress_bar=True), log_interval=None)
+    model.learn(60, PlannerTrainingCallback(log_interval=2, eval_interval=4, progress_bar=True), log_interval=None)
     rows = [row for row in memory.rows if "planner/loss" in row]
     assert [row["planner/n_updates"] for row in rows] == [2, 4, 5]
-    assert [row["step"] for row in rows] == [82, 84, 85]  # nothing comes after, and a curve needs an axis
-    assert [row["time/total_timesteps"] for row in rows] == [82, 84, 85]  # in a CSV, too
+    assert [row["step"] for row in rows] == [62, 64, 65]  # nothing comes after, and a curve needs an axis
+    assert [row["time/total_timesteps"] for row in rows] == [62, 64, 65]  # in a CSV, too
     assert all(np.isfinite(row["planner/loss"]) and row["planner/loss"] > 0 for row in rows)
     assert ["planner/present_error_d2" in row for row in rows] == [False, True, True]
     shown = capsys.readouterr().err
     assert "planner: 100%" in shown and "5/5" in shown
-    make().learn(40, PlannerTrainingCallback())
+    make().learn(15, PlannerTrainingCallback())
     assert "planner" not in capsys.readouterr().err
 
 
 def test_rows_of_the_planner_are_its_own_and_in_order():
     memory = Memory()
-    model = make(planner_train_freq=40)
+    model = make(planner_train_freq=16)
     model.set_logger(logger := Logger(None, [memory]))
-    model.learn(100, PlannerTrainingCallback(log_interval=2), log_interval=1)
+    model.learn(35, PlannerTrainingCallback(log_interval=2), log_interval=1)
     of_planner = [row for row in memory.rows if "planner/loss" in row]
     of_expert = [row for row in memory.rows if "planner/loss" not in row]
     assert [row["planner/n_updates"] for row in of_planner] == 3 * [2, 4, 6]
@@ -280,14 +279,14 @@ def test_rows_of_the_planner_go_where_those_of_the_expert_do():
     memory = Memory()
     model = make()
     model.set_logger(Forwarding(Logger(None, [memory])))
-    model.learn(100, log_interval=1)
+    model.learn(20, log_interval=1)
     assert any("planner/loss" in row for row in memory.rows) and any("time/episodes" in row for row in memory.rows)
 
 
 @pytest.mark.parametrize(("how", "is_told"), [({}, True), ({"progress_bar": True}, False), ({"verbose": 1}, False)])
 def test_a_training_that_shows_nothing_says_that_it_begins(how, is_told, capsys):
     verbose = how.pop("verbose", 0)
-    make(verbose=verbose).learn(40, PlannerTrainingCallback(**how))
+    make(verbose=verbose).learn(10, PlannerTrainingCallback(**how))
     told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("Training the planner: 6 updates")]
     assert len(told) == is_told and all("progress_bar=True" in line for line in told)
 
@@ -299,7 +298,7 @@ def test_cancelling_early_keeps_the_weights(monkeypatch, capsys):
     whole = make()
     untrained = planner_of(whole)
     interrupt_at(monkeypatch, 3, KeyboardInterrupt)
-    model = make().learn(40)
+    model = make().learn(15)
     assert "interrupted after 3 of 6 updates" in capsys.readouterr().out
     assert model.policy.planner_updates == 3 and differ(planner_of(model), untrained)
     answers = [model.predict(model.env.reset(), deterministic=True)[0] for _ in range(2)]
@@ -316,7 +315,7 @@ def retrain_on_other_data(model):
 
 
 def test_cancelling_before_the_first_update_keeps_an_earlier_planner(monkeypatch, capsys):
-    model = make().learn(40)
+    model = make().learn(15)
     kept = planner_of(model)
     interrupt_at(monkeypatch, 0, KeyboardInterrupt)
     retrain_on_other_data(model)
@@ -329,7 +328,7 @@ def test_cancelling_before_the_first_update_keeps_an_earlier_planner(monkeypatch
 def test_a_training_that_diverges_leaves_the_planner_as_it_was(monkeypatch, is_trained):
     model = make()
     if is_trained:
-        model.learn(40)
+        model.learn(15)
     kept, loss = planner_of(model), InpaintingPlanner.loss
 
     def breaks(*args, **kwargs):
@@ -337,7 +336,7 @@ def test_a_training_that_diverges_leaves_the_planner_as_it_was(monkeypatch, is_t
 
     monkeypatch.setattr(InpaintingPlanner, "loss", breaks)
     with pytest.raises(FloatingPointError, match="stays as it was"):
-        retrain_on_other_data(model) if is_trained else model.learn(40)
+        retrain_on_other_data(model) if is_trained else model.learn(15)
     assert_same(planner_of(model), kept)
     assert model.policy.who_answers == ("planner" if is_trained else "expert")
     assert np.isfinite(model.predict(model.env.reset(), deterministic=True)[0]).all()
@@ -345,36 +344,41 @@ def test_a_training_that_diverges_leaves_the_planner_as_it_was(monkeypatch, is_t
 
 def test_cancelling_one_of_several_trainings_does_not_end_learning(monkeypatch, trainings):
     interrupt_at(monkeypatch, 2, KeyboardInterrupt)
-    model = make(planner_train_freq=40).learn(100)
-    assert begun(trainings) == [40, 80, 100] and list(trainings.values()) == [2, 6, 6]
-    assert model.num_timesteps == 100
+    model = make(planner_train_freq=8).learn(20)
+    assert begun(trainings) == [8, 16, 20] and list(trainings.values()) == [2, 6, 6]
+    assert model.num_timesteps == 20
 
 
 # ---------------------------------------------------------------------------------------------------- going on
 
 
-@pytest.mark.parametrize("killed_at", [1, 4, 5])
-def test_a_killed_training_ends_as_if_it_had_not_been_killed(tmp_path, monkeypatch, trainings, killed_at):
-    def callbacks(folder):
-        return [TrainingCheckpointCallback(folder, 30), PlannerTrainingCallback(folder=folder, save_interval=2)]
+@pytest.fixture(scope="module")
+def whole():
+    """An agent of 15 steps; tests must leave it as it is."""
+    return make().learn(15)
 
-    whole = make().learn(60, callbacks(tmp_path / "whole"))
+
+@pytest.mark.parametrize("killed_at", [1, 4, 5])
+def test_a_killed_training_ends_as_if_it_had_not_been_killed(whole, tmp_path, monkeypatch, trainings, killed_at):
+    def callbacks():
+        return [TrainingCheckpointCallback(tmp_path, 5), PlannerTrainingCallback(folder=tmp_path, save_interval=2)]
+
     interrupt_at(monkeypatch, killed_at, Killed())
     with pytest.raises(Killed):
-        make().learn(60, callbacks(tmp_path / "killed"))
+        make().learn(15, callbacks())
     resumed = make()
     untrained = planner_of(resumed)
-    restore_training(resumed, tmp_path / "killed" / "checkpoint.zip")
-    assert resumed.num_timesteps == 60 and not resumed.policy.planner_is_trained
+    restore_training(resumed, tmp_path / "checkpoint.zip")
+    assert resumed.num_timesteps == 15 and not resumed.policy.planner_is_trained
     trainings.clear()
-    resumed.learn(0, callbacks(tmp_path / "killed"), reset_num_timesteps=False)
+    resumed.learn(0, callbacks(), reset_num_timesteps=False)
     assert list(trainings.values()) == [6 - killed_at // 2 * 2]  # from the last checkpoint, or from the start
     assert_same(resumed.policy.state_dict(), whole.policy.state_dict())
     assert differ(planner_of(resumed), untrained)
 
 
 @pytest.mark.parametrize(
-    ("save_freq", "killed_at", "planner_first"), [(25, 60, True), (25, 50, True), (25, 50, False), (50, 99, False)]
+    ("save_freq", "killed_at", "planner_first"), [(5, 12, True), (5, 10, True), (5, 10, False), (10, 19, False)]
 )
 def test_a_resumed_run_loses_and_repeats_no_training(tmp_path, trainings, save_freq, killed_at, planner_first):
     def callbacks():
@@ -382,22 +386,22 @@ def test_a_resumed_run_loses_and_repeats_no_training(tmp_path, trainings, save_f
         return both[::-1] if planner_first else both
 
     with pytest.raises(Killed):
-        make(planner_train_freq=50).learn(120, [*callbacks(), Kill(killed_at)])
+        make(planner_train_freq=10).learn(24, [*callbacks(), Kill(killed_at)])
     before = begun(trainings)
-    assert before == [n for n in (50, 100) if n < killed_at]
-    resumed = make(planner_train_freq=50)
+    assert before == [n for n in (10, 20) if n < killed_at]
+    resumed = make(planner_train_freq=10)
     restore_training(resumed, tmp_path / "checkpoint.zip")
     at = resumed.num_timesteps
     trainings.clear()
-    resumed.learn(120 - at, callbacks(), reset_num_timesteps=False)
+    resumed.learn(24 - at, callbacks(), reset_num_timesteps=False)
     # What came after the checkpoint is made again, on the new data; a training at the checkpoint itself is in it
     # or beside it, in the planner's own.
-    assert begun(trainings) == [n for n in (50, 100, 120) if n > at or (n == at and n not in before)]
+    assert begun(trainings) == [n for n in (10, 20, 24) if n > at or (n == at and n not in before)]
     assert resumed.policy.planner_updates == 6
 
 
 def test_the_planners_checkpoints_are_spread_by_time_and_size(tmp_path, monkeypatch):
-    """Ten minutes apart, and 2,000 s apart once the file has a gigabyte; an update takes 100 s."""
+    """Ten minutes apart, and 2,000 s apart once the file has a gigabyte; an update takes 200 s."""
     written, now = [], [0.0]
 
     def save(path, state, metadata):
@@ -407,15 +411,15 @@ def test_the_planners_checkpoints_are_spread_by_time_and_size(tmp_path, monkeypa
 
     monkeypatch.setattr(checkpoint, "save_tree", save)
     monkeypatch.setattr(checkpoint.time, "monotonic", lambda: now[0])
-    model = make().learn(40)
+    model = make().learn(15)
 
     def pass_time(trainer):
-        now[0] += 100.0
+        now[0] += 200.0
         return original(trainer)
 
     original = PlannerTrainer.step
     monkeypatch.setattr(PlannerTrainer, "step", pass_time)
-    model.train_planner(60, folder=tmp_path)
+    model.train_planner(30, folder=tmp_path)
     assert written == [600, 1200, 1800, 3800, 5800, 6000]
 
 
@@ -429,39 +433,39 @@ def test_a_stop_amid_one_of_several_trainings_loses_no_update(tmp_path, training
 
     checkpointing = TrainingCheckpointCallback(tmp_path, 1000)
     with pytest.raises(KeyboardInterrupt):
-        make(planner_train_freq=40).learn(
-            60, [checkpointing, PlannerTrainingCallback(folder=tmp_path, should_stop=should_stop)]
+        make(planner_train_freq=10).learn(
+            15, [checkpointing, PlannerTrainingCallback(folder=tmp_path, should_stop=should_stop)]
         )
     assert checkpointing.save() and list(trainings.values()) == [4]
-    resumed = make(planner_train_freq=40)
+    resumed = make(planner_train_freq=10)
     restore_training(resumed, tmp_path / "checkpoint.zip")
     trainings.clear()
-    resumed.learn(20, PlannerTrainingCallback(folder=tmp_path), reset_num_timesteps=False)
-    assert begun(trainings) == [40, 60] and list(trainings.values()) == [2, 6]
+    resumed.learn(5, PlannerTrainingCallback(folder=tmp_path), reset_num_timesteps=False)
+    assert begun(trainings) == [10, 15] and list(trainings.values()) == [2, 6]
 
 
 def test_a_checkpoint_of_other_data_is_not_gone_on_from(tmp_path, trainings):
     callback = PlannerTrainingCallback(folder=tmp_path)
-    first = make().learn(40, callback)
-    make(seed=1).learn(40, PlannerTrainingCallback(folder=tmp_path))  # as many steps, but other ones
+    first = make().learn(15, callback)
+    make(seed=1).learn(15, PlannerTrainingCallback(folder=tmp_path))  # as many steps, but other ones
     assert list(trainings.values()) == [6, 6]
-    second = make().learn(40, PlannerTrainingCallback(folder=tmp_path))
+    second = make().learn(15, PlannerTrainingCallback(folder=tmp_path))
     assert list(trainings.values()) == [6, 6, 6]
-    third = make().learn(40, PlannerTrainingCallback(folder=tmp_path))  # the very same: nothing is left to do
+    third = make().learn(15, PlannerTrainingCallback(folder=tmp_path))  # the very same: nothing is left to do
     assert list(trainings.values()) == [6, 6, 6]
     for again in (second, third):
         assert_same(planner_of(again), planner_of(first))
 
 
 def test_a_checkpoint_of_other_settings_is_refused(tmp_path):
-    make().learn(40, PlannerTrainingCallback(folder=tmp_path))
+    make().learn(15, PlannerTrainingCallback(folder=tmp_path))
     with pytest.raises(ValueError, match="gradient_steps was 6 and is now 7"):
-        make(planner_gradient_steps=7).learn(40, PlannerTrainingCallback(folder=tmp_path))
+        make(planner_gradient_steps=7).learn(15, PlannerTrainingCallback(folder=tmp_path))
 
 
 @pytest.mark.parametrize("state", [{}, [], {"trainer": {}}], ids=str)
 def test_a_checkpoint_of_something_else_is_refused(state, tmp_path):
-    model = make().learn(40, PlannerTrainingCallback(folder=tmp_path))
+    model = make().learn(15, PlannerTrainingCallback(folder=tmp_path))
     path = tmp_path / PLANNER_CHECKPOINT_NAME
     kept = load_tree(path)
     save_tree(path, state if state != {"trainer": {}} else {**kept, **state})
@@ -492,14 +496,14 @@ def test_without_an_interval_there_is_one_row_at_the_end_as_with_one_of_all_upda
         memory = Memory()
         model = make(planner_gradient_steps=5)
         model.set_logger(Logger(None, [memory]))
-        model.learn(60, callback=PlannerTrainingCallback(log_interval=interval), log_interval=None)
+        model.learn(15, callback=PlannerTrainingCallback(log_interval=interval), log_interval=None)
         rows.append([row["planner/n_updates"] for row in memory.rows if "planner/n_updates" in row])
     assert rows == [[5], [5]]
 
 
 def test_a_file_of_a_second_training_answers_as_the_callback_saw_it(tmp_path):
     """The planner of before is trained, and knows nothing of what the expert learns now."""
-    model = make().learn(30)
+    model = make().learn(10)
     obs = model.observation_space.sample()
     obs["delay"][:] = 2
     seen = []
@@ -511,7 +515,7 @@ def test_a_file_of_a_second_training_answers_as_the_callback_saw_it(tmp_path):
                 seen.append(model.predict(obs, deterministic=True)[0])
             return True
 
-    model.learn(20, callback=Saving(), reset_num_timesteps=False)
+    model.learn(5, callback=Saving(), reset_num_timesteps=False)
     loaded = SAID.load(tmp_path / "best_model.zip", device="cpu")
     assert loaded.policy.who_answers == "expert" and model.policy.who_answers == "planner"
     np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], seen[0])
@@ -523,7 +527,7 @@ def test_an_environment_that_a_callback_has_played_begins_new_episodes(what):
         has_played = False
 
         def _on_rollout_start(self):
-            if self.num_timesteps == 50 and not self.has_played:
+            if self.num_timesteps == 20 and not self.has_played:
                 self.has_played = True
                 self.model.train_planner(3, trial_episodes=1)
                 if what == "student":
@@ -533,7 +537,7 @@ def test_an_environment_that_a_callback_has_played_begins_new_episodes(what):
             return True
 
     callback = Plays()
-    model = make().learn(100, callback)
-    assert callback.has_played and model.num_timesteps == 100
-    steps = model.replay_buffer.steps[:100, 0]
-    assert steps[50] == 0 and model.replay_buffer.size() == 100
+    model = make().learn(25, callback)
+    assert callback.has_played and model.num_timesteps == 25
+    steps = model.replay_buffer.steps[:25, 0]
+    assert steps[20] == 0 and model.replay_buffer.size() == 25

@@ -75,8 +75,8 @@ def observations(draw):
 def agents():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # trained for a moment
-        said = make(delayed(1, max_delay=2)).learn(40)
-        plain = make(Drift()).learn(40)
+        said = make(delayed(1, max_delay=2)).learn(25)
+        plain = make(Drift()).learn(25)
     return {"expert": said, "planner": said, "plain": plain, "DelayedSAC": make(cls=DelayedSAC).learn(25)}
 
 

@@ -60,7 +60,7 @@ class Scaled(FlattenExtractor):
 def test_values_are_those_of_critics_in_use(layer):
     """A planner's windows end in a batch of one value, which BatchNorm cannot train on."""
     extractor = {"features_extractor_class": Scaled, "features_extractor_kwargs": {"layer": layer}}
-    model = make(Drift(length=1000), policy_kwargs={"net_arch": [32], **extractor}).learn(40)
+    model = make(Drift(length=1000), policy_kwargs={"net_arch": [32], **extractor}).learn(25)
     assert model.policy.planner_is_trained
     states, actions = th.randn(3, 4, 2), th.zeros(3, 4, 1)
     model.policy.set_training_mode(True)
@@ -235,7 +235,7 @@ def test_a_zeros_sign_changes_no_answer(saved):
 
 
 def test_a_planner_for_one_age_refuses_others():
-    model = make(planner_kwargs={"mask": "fixed", "temperature": 0.0}).learn(60)
+    model = make(planner_kwargs={"mask": "fixed", "temperature": 0.0}).learn(25)
     batch = observe()
     assert batch["delay"][:3, 0].tolist() == [0, 1, 2]
     answers = answer(model, batch)
@@ -262,7 +262,7 @@ def test_a_warmup_changes_no_answer(saved):
 def test_a_planner_of_one_age_needs_to_know_those_that_the_expert_does_not_answer(tmp_path):
     env = delayed(delay=(0, 2))
     with pytest.warns(UserWarning, match="mask='fixed' plans at age 2 only"):
-        model = make(env, planner_kwargs={"mask": "fixed"}).learn(60)
+        model = make(env, planner_kwargs={"mask": "fixed"}).learn(25)
     model.set_answer("both", expert_up_to=1)
     model.set_env(env)
     model.save(tmp_path / "agent.zip")
@@ -314,7 +314,7 @@ def remembering(state_history=True):
 
 @pytest.fixture(scope="module")
 def trained_with_extra_states():
-    return make(remembering(), planner_kwargs={"extra_state_probability": 0.5}).learn(80)
+    return make(remembering(), planner_kwargs={"extra_state_probability": 0.5}).learn(30)
 
 
 def test_known_states_reach_the_planner_and_change_the_plan(trained_with_extra_states, monkeypatch):
@@ -358,14 +358,14 @@ def test_an_agent_with_extra_states_is_saved_and_repeats(trained_with_extra_stat
     assert np.array_equal([answer(loaded, row) for row in rows_of(batch)], expected)
     loaded.load_replay_buffer(tmp_path / "replay")
     assert same_replay(loaded, model)
-    loaded.learn(20, reset_num_timesteps=False)
-    assert loaded.num_timesteps == 100
+    loaded.learn(10, reset_num_timesteps=False)
+    assert loaded.num_timesteps == 40
     with pytest.raises(ValueError, match="Observation spaces do not match"):
         SAID.load(tmp_path / "said", env=remembering(state_history=False))
 
 
 def test_the_expert_does_not_read_extra_states(trained_with_extra_states):
-    sac, plain = (make(remembering(flag), cls=StableSAC).learn(80) for flag in (True, False))
+    sac, plain = (make(remembering(flag), cls=StableSAC).learn(30) for flag in (True, False))
     assert same_replay(sac, plain) and same_replay(trained_with_extra_states, plain)
     for name, value in plain.policy.state_dict().items():
         assert th.equal(sac.policy.state_dict()[name], value), name
@@ -549,7 +549,7 @@ def test_no_actor_that_has_not_learned_decides():
 def test_where_no_expert_has_learned_its_actor_does_not_decide(tmp_path):
     model = make(learning_starts=100, planner_kwargs={"decided_by": "actor"})
     with pytest.warns(UserWarning, match="No expert has learned whose actor could decide"):
-        model.learn(40)
+        model.learn(25)
     model.save(tmp_path / "agent.zip")
     loaded, obs = SAID.load(tmp_path / "agent.zip", device="cpu"), observe()
     assert loaded.policy.planner.config.decided_by == "plan"
@@ -558,7 +558,7 @@ def test_where_no_expert_has_learned_its_actor_does_not_decide(tmp_path):
 
 def test_without_delay_there_are_no_ages_to_share():
     model = make(Drift())
-    model.learn(40)
+    model.learn(25)
     with pytest.raises(ValueError, match="Without delay there is no age but 0"):
         model.set_answer("both", expert_up_to=0)
 
@@ -606,7 +606,7 @@ def test_every_age_at_which_the_expert_answers_comes_back_from_its_part():
 @pytest.mark.parametrize("how", ["actor", "both"])
 def test_a_plan_whose_first_action_is_the_actor_s_own(how):
     """Without an average, whose weights would take no gradient."""
-    model, obs = make(delayed((0, 2)), actor_averaging=0.0).learn(60), observe()
+    model, obs = make(delayed((0, 2)), actor_averaging=0.0).learn(25), observe()
     if how == "actor":
         model.set_planner(decided_by="actor")
     else:

@@ -26,7 +26,7 @@ SECOND = SECOND_CHECKPOINT_NAME.format(mask="own")
 
 
 def make_two(delay=(0, 2), **kwargs):
-    return make(env=pendulum(delay=delay, max_delay=2), planner_ways=WAYS, **kwargs)
+    return make(env=pendulum(6, delay, 2), planner_ways=WAYS, **kwargs)
 
 
 def rig(monkeypatch, best):
@@ -68,7 +68,7 @@ def test_the_agent_keeps_the_planner_that_does_best(monkeypatch, updates, tmp_pa
     given = rig(monkeypatch, "own_ages")
     model = make_two(planner_trial_episodes=3)
     config = model.policy.planner.config
-    model.learn(60)
+    model.learn(25)
     assert updates == ["random"] * 5 + ["own"] * 5
     (second,) = given[0]
     assert model.policy.planner is second and model.policy.who_answers == "planner"
@@ -90,7 +90,7 @@ def test_the_agent_keeps_the_planner_that_does_best(monkeypatch, updates, tmp_pa
 def test_on_logs_what_a_trial_chose_before_is_undone(monkeypatch, updates):
     rig(monkeypatch, "own_ages")
     model = make_two(planner_trial_episodes=3)
-    model.learn(60)
+    model.learn(25)
     chosen, obs = model.policy.planner, pendulum(delay=(0, 2)).reset(seed=1)[0]
     before = answer(model, obs)
     with pytest.raises(ValueError, match="dataset"):
@@ -107,7 +107,7 @@ def test_on_logs_what_a_trial_chose_before_is_undone(monkeypatch, updates):
 
 def test_a_training_in_a_folder_is_gone_on_with_whichever_planner_the_agent_kept(monkeypatch, updates, tmp_path):
     rig(monkeypatch, "own_ages")
-    model = make_two().learn(60)
+    model = make_two().learn(25)
     model.train_planner(folder=tmp_path, trial_episodes=3)
     assert model.planner_kwargs["mask"] == "own"
     second = weights(model.policy.planner)
@@ -125,7 +125,7 @@ def test_both_begin_with_one_first_guess(monkeypatch):
 
     monkeypatch.setattr(trainer_module, "fit_first_guess", counted)
     given = rig(monkeypatch, "first")
-    model = make_two(planner_trial_episodes=3).learn(60)
+    model = make_two(planner_trial_episodes=3).learn(25)
     ((second,),) = given
     assert len(trained) == 1
     assert same(weights(second.first_guess), weights(model.policy.planner.first_guess))
@@ -134,7 +134,7 @@ def test_both_begin_with_one_first_guess(monkeypatch):
 
 def test_a_later_training_has_both_again_and_the_way_back_stands_open(monkeypatch, updates):
     rig(monkeypatch, "own_ages")
-    model = make_two(planner_trial_episodes=3).learn(60)
+    model = make_two(planner_trial_episodes=3).learn(25)
     updates.clear()
     rig(monkeypatch, "first")
     model.train_planner()
@@ -144,7 +144,7 @@ def test_a_later_training_has_both_again_and_the_way_back_stands_open(monkeypatc
 
 
 def test_each_way_is_played_by_its_own_planner():
-    model = make_two().learn(60)
+    model = make_two(planner_kwargs={"warmup_steps": 0}).learn(25)  # so that the two soon differ
     first = model.policy.planner
     second = model.policy.new_planner(replace(first.config, mask="own"))
     model.make_planner_trainer(planner=second).train()
@@ -157,7 +157,7 @@ def test_each_way_is_played_by_its_own_planner():
     seed = int(np.random.randint(2**31))
     for name, planner in (("first", first), ("own_ages", second)):
         model.policy.take_planner(planner, ways.in_way(before, WAYS[name]))
-        env = DummyVecEnv([lambda: Monitor(pendulum(delay=(0, 2)))])
+        env = DummyVecEnv([lambda: Monitor(pendulum(6, (0, 2)))])
         for i in range(2):
             env.seed(seed + i)
             assert played[name][i] == pytest.approx(evaluate_policy(model, env, 1)[0], rel=1e-5)
@@ -168,23 +168,17 @@ def test_each_way_is_played_by_its_own_planner():
 
 def test_by_default_there_are_two_and_one_of_a_fixed_delay_or_without_a_trial(updates):
     tiny = {"depth": 1, "d_model": 32, "horizon": 3, "batch_size": 16}  # nothing of how to decide
-    settings = {"learning_starts": 20, "buffer_size": 500, "seed": 0, "device": "cpu", "planner_gradient_steps": 3}
+    settings = {"learning_starts": 20, "batch_size": 16, "buffer_size": 500, "seed": 0, "device": "cpu"}
+    settings |= {"policy_kwargs": {"net_arch": [16]}, "planner_kwargs": tiny, "planner_gradient_steps": 2}
     for delay, episodes, masks in (((0, 2), 1, ["random", "own"]), (2, 1, ["random"]), ((0, 2), 0, ["random"])):
         updates.clear()
-        model = SAID(
-            "MlpPolicy",
-            pendulum(delay=delay, max_delay=2),
-            planner_kwargs=tiny,
-            planner_trial_episodes=episodes,
-            **settings,
-        )
-        model.learn(60)
-        assert updates == [mask for mask in masks for _ in range(3)]
-    assert make(env=delayed(), planner_ways={}).learn(60).policy.planner.config.mask == "random"
+        SAID("MlpPolicy", pendulum(6, delay, 2), planner_trial_episodes=episodes, **settings).learn(25)
+        assert updates == [mask for mask in masks for _ in range(2)]
+    assert make(env=delayed(), planner_ways={}).learn(25).policy.planner.config.mask == "random"
 
 
 def test_logs_do_not_tell_at_which_age_their_decisions_were_made(updates):
-    model, other = make_two().learn(60), make_two(seed=1).learn(60)
+    model, other = make_two().learn(25), make_two(seed=1).learn(25)
     model.take_dataset(other.replay_buffer)
     updates.clear()
     model.train_planner(trial_episodes=1)
@@ -192,14 +186,14 @@ def test_logs_do_not_tell_at_which_age_their_decisions_were_made(updates):
 
 
 def test_trainings_amid_learning_are_of_the_first_alone(updates):
-    make_two(planner_trial_episodes=1, planner_train_freq=30).learn(60)
-    assert updates == ["random"] * 10 + ["own"] * 5  # at 30 steps, and at the end
+    make_two(planner_trial_episodes=1, planner_train_freq=21).learn(25)
+    assert updates == ["random"] * 10 + ["own"] * 5  # at 21 steps, and at the end
 
 
 def test_a_training_stopped_amid_the_second_goes_on_there(monkeypatch, updates, tmp_path):
     rig(monkeypatch, "own_ages")
-    whole = make_two(planner_trial_episodes=3).learn(60)
-    stopped = make_two(planner_trial_episodes=0).learn(60)
+    whole = make_two(planner_trial_episodes=3).learn(25)
+    stopped = make_two(planner_trial_episodes=0).learn(25)
     updates.clear()
     with pytest.raises(KeyboardInterrupt):
         stopped.train_planner(folder=tmp_path, trial_episodes=3, should_stop=lambda: updates.count("own") == 2)
@@ -214,7 +208,7 @@ def test_a_training_stopped_amid_the_second_goes_on_there(monkeypatch, updates, 
 
 def test_after_a_file_a_training_that_is_done_is_found_again(monkeypatch, updates, tmp_path):
     rig(monkeypatch, "own_ages")
-    model = make_two(planner_trial_episodes=0).learn(60)
+    model = make_two(planner_trial_episodes=0).learn(25)
     model.train_planner(folder=tmp_path, trial_episodes=3)
     assert model.policy.planner.config.mask == "own"
     model.save(tmp_path / "agent.zip")
@@ -230,7 +224,7 @@ def test_after_a_file_a_training_that_is_done_is_found_again(monkeypatch, update
 def test_a_checkpoint_answers_as_the_trial_chose(best, monkeypatch, tmp_path):
     rig(monkeypatch, best)
     agents = [make_two(planner_trial_episodes=3) for _ in range(2)]
-    agents[0].learn(60, callback=[PlannerTrainingCallback(), TrainingCheckpointCallback(tmp_path)])
+    agents[0].learn(25, callback=[PlannerTrainingCallback(), TrainingCheckpointCallback(tmp_path)])
     restore_training(agents[1], tmp_path / "checkpoint.zip")
     assert agents[1].planner_kwargs == agents[0].planner_kwargs
     obs = observe(5, pendulum(delay=2, max_delay=2))
@@ -246,7 +240,7 @@ def test_ctrl_c_amid_the_second_leaves_the_first_without_a_trial(monkeypatch, up
         step(trainer)
 
     monkeypatch.setattr(PlannerTrainer, "step", interrupted)
-    model = make_two(planner_trial_episodes=3).learn(60)
+    model = make_two(planner_trial_episodes=3).learn(25)
     assert given == [] and model.policy.who_answers == "planner"
     assert model.policy.planner.config.mask == "random" and model.policy.planner_updates == 5
     assert "planner of mask='own' interrupted after 2 of 5 updates; it is left out" in capsys.readouterr().out
@@ -254,12 +248,12 @@ def test_ctrl_c_amid_the_second_leaves_the_first_without_a_trial(monkeypatch, up
 
 def test_rows_of_the_second_are_logged_behind_those_of_the_first(monkeypatch, tmp_path):
     rig(monkeypatch, "own_ages")
-    model = make_two().learn(60)
+    model = make_two().learn(25)
     model.set_logger(configure(str(tmp_path), ["csv"]))
     rows = []
     monkeypatch.setattr(model.logger.output_formats[0], "write", lambda row, _, step: rows.append((step, {**row})))
     model.train_planner(log_interval=2, trial_episodes=3)
-    assert [step for step, _ in rows] == [62, 64, 65, 67, 69, 70, 70]
+    assert [step for step, _ in rows] == [27, 29, 30, 32, 34, 35, 35]
     assert "trial/own_ages_return" in rows[-1][1]
 
 

@@ -7,7 +7,7 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_agent import answer, make, observe
-from small_student import QUICK, taught_agent
+from small_student import QUICK
 from small_task import Drift, delayed
 from stable_baselines3.common.type_aliases import PyTorchObs
 
@@ -15,19 +15,6 @@ from sb3_said import SAID
 from sb3_said.delays.space import delayed_space
 from sb3_said.files.archive import SavedFileError
 from sb3_said.said.student import Student
-
-
-@pytest.fixture(scope="module")
-def taught():
-    return taught_agent()
-
-
-@pytest.fixture
-def pupil(taught):
-    """The same agent, for tests that distill another student."""
-    before = taught.policy.student
-    yield taught
-    taught.policy.student, taught.student_width = before, before.width
 
 
 def test_it_answers_as_the_planner_and_an_untaught_one_does_not(taught):

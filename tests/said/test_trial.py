@@ -25,23 +25,23 @@ OF_ONE_PLANNER = {name: way for name, way in WAYS.items() if name != "own_ages"}
 
 @pytest.fixture(scope="module")
 def trained():
-    return make(env=pendulum(delay=(0, 2)), planner_ways=OF_ONE_PLANNER).learn(60)
+    return make(env=pendulum(8, (0, 2)), planner_ways=OF_ONE_PLANNER).learn(25)
 
 
 def test_returns_are_those_of_each_who_can_answer(trained, monkeypatch):
     monkeypatch.setattr(trial, "GO_ON", 6)  # all of them
     before = trained.policy.planner.config
     np.random.seed(3)
-    found = trial.play_trial(trained, n_episodes=3)
+    found = trial.play_trial(trained, n_episodes=2)
     played = found.returns
     np.random.seed(3)
     seed = int(np.random.randint(2**31))
     assert list(played) == ["weighed", "actor", "default", "one_step", "inpainted", "planner", "expert"]
-    assert found.n_steps == 7 * 3 * 15
+    assert found.n_steps == 7 * 2 * 8
     assert set(found.ages) <= {0, 1, 2}
     assert trained.policy.planner.config == before
     for name, returns in played.items():
-        env = DummyVecEnv([lambda: Monitor(pendulum(delay=(0, 2)))])
+        env = DummyVecEnv([lambda: Monitor(pendulum(8, (0, 2)))])
         trained.set_planner(**WAYS.get(name, {}))
         for i, found_return in enumerate(returns):
             env.seed(seed + i)
@@ -79,12 +79,12 @@ def test_the_three_best_ways_and_the_expert_play_on(trained, monkeypatch):
 
 
 def test_an_expert_that_has_not_learned_without_delay_acts_on_no_guess():
-    model = make(env=pendulum(delay=2), planner_ways={"actor": WAYS["actor"]}).learn(60)
+    model = make(env=pendulum(delay=2), planner_ways={"actor": WAYS["actor"]}).learn(25)
     assert list(trial.play_trial(model, n_episodes=1).returns) == ["planner", "expert"]
 
 
 def test_without_delay_the_actor_is_the_expert_and_not_tried_twice():
-    model = make(env=pendulum(delay=0), planner_ways={"actor": WAYS["actor"]}).learn(60)
+    model = make(env=pendulum(delay=0), planner_ways={"actor": WAYS["actor"]}).learn(25)
     assert model.trained_ages == [0]
     assert list(trial.play_trial(model, n_episodes=1).returns) == ["planner", "expert"]
 
@@ -99,19 +99,19 @@ def test_who_falls_at_once_does_not_tell_an_episodes_age(trained, monkeypatch):
 
 def test_the_monitor_file_holds_the_training_and_not_the_trial(tmp_path):
     env = Monitor(pendulum(), str(tmp_path / "0"))
-    model = make(env=env, planner_trial_episodes=2).learn(60)
+    model = make(env=env, planner_trial_episodes=2).learn(30)
     trial.play_trial(model, n_episodes=1)
-    model.learn(30, reset_num_timesteps=False)
+    model.learn(15, reset_num_timesteps=False)
     rows = (tmp_path / "0.monitor.csv").read_text().splitlines()[2:]
-    assert len(rows) == 4 + 2  # episodes of 15 steps
+    assert len(rows) == 2 + 1  # episodes of 15 steps
 
 
 def test_the_file_of_a_vec_monitor_holds_the_training_alone_too(tmp_path):
     env = VecMonitor(DummyVecEnv([pendulum] * 2), str(tmp_path / "0"))
-    model = make(env=env, planner_trial_episodes=2).learn(60)
+    model = make(env=env, planner_trial_episodes=2).learn(30)
     trial.play_trial(model, n_episodes=2)
-    model.learn(60, reset_num_timesteps=False)
-    assert len((tmp_path / "0.monitor.csv").read_text().splitlines()[2:]) == 2 * 2 + 2 * 2
+    model.learn(30, reset_num_timesteps=False)
+    assert len((tmp_path / "0.monitor.csv").read_text().splitlines()[2:]) == 2 * 1 + 2 * 1
 
 
 def test_a_way_that_the_planner_already_has_is_not_played_twice_and_the_way_back_is(trained):
@@ -131,7 +131,7 @@ def test_episodes_of_several_environments_are_the_same_ones_whoever_ends_first()
         return Monitor(gym.wrappers.TransformReward(pendulum(n_steps, (0, 2)), lambda _: 1.0))
 
     env = DummyVecEnv([lambda: make_env(9), lambda: make_env(4)])
-    model = make(env=env, planner_ways={"b": {"sampling_steps": 1}}).learn(80)
+    model = make(env=env, planner_ways={"b": {"sampling_steps": 1}}).learn(40)
     found = trial.play_trial(model, n_episodes=7)
     assert found.n_steps == 3 * 2 * 4 * 9  # three players, two environments, of which the second waits for the first
     for returns in found.returns.values():
@@ -145,7 +145,7 @@ def test_a_trial_in_environments_that_are_made_is_the_one_in_the_trainings(train
     made, closed = [], []
 
     def make_env(n_envs):
-        made.append(DummyVecEnv([lambda: Monitor(pendulum(delay=(0, 2)))] * n_envs))
+        made.append(DummyVecEnv([lambda: Monitor(pendulum(8, (0, 2)))] * n_envs))
         monkeypatch.setattr(made[-1], "close", lambda: closed.append(n_envs))
         return made[-1]
 
@@ -172,25 +172,26 @@ def test_environments_that_are_made_show_what_those_of_the_training_do(monkeypat
         env = DummyVecEnv([lambda: Monitor(pendulum())] * n_envs)
         return VecNormalize(env, norm_obs_keys=["observation"], **kwargs)
 
-    model, made = make(env=make_env(), planner_ways={}).learn(60), []
+    model, made = make(env=make_env(), planner_ways={}).learn(25), []
     np.random.seed(3)
-    expected = trial.play_trial(model, 3).returns
+    expected = trial.play_trial(model, 2).returns
     np.random.seed(3)
-    found = trial.play_trial(model, 3, make_env=lambda n: made.append(make_env(n)) or made[0]).returns
+    found = trial.play_trial(model, 2, make_env=lambda n: made.append(make_env(n)) or made[0]).returns
     np.testing.assert_allclose(found["expert"], expected["expert"], rtol=1e-4)
     own = model.get_vec_normalize_env()
-    assert own.training and made[0].obs_rms["observation"].count == own.obs_rms["observation"].count > 60
+    assert own.training and made[0].obs_rms["observation"].count == own.obs_rms["observation"].count > 25
 
     for kwargs in (None, {"clip_obs": 0.5, "epsilon": 1.0}):  # without one, and of other settings
         np.random.seed(3)
         alike = trial.play_trial(
-            model, 3, make_env=lambda n, k=kwargs: make_env(n).venv if k is None else make_env(n, **k)
+            model, 2, make_env=lambda n, k=kwargs: make_env(n).venv if k is None else make_env(n, **k)
         )
         np.testing.assert_allclose(alike.returns["expert"], expected["expert"], rtol=1e-4)
 
 
 def test_where_environments_cannot_be_made_the_trainings_is_played_in_and_nothing_is_lost(recwarn):
-    env = VecNormalize(DummyVecEnv([lambda: Monitor(pendulum())]), norm_obs_keys=["observation"])
+    env = VecNormalize(DummyVecEnv([lambda: Monitor(pendulum(5))]), norm_obs_keys=["observation"])
+    model = make(env=env, planner_ways={}, planner_trial_episodes=2, learning_starts=5)
 
     def fails(n):
         raise OSError("Address already in use")
@@ -202,9 +203,8 @@ def test_where_environments_cannot_be_made_the_trainings_is_played_in_and_nothin
         (lambda n: env, None),  # the training's own
     ]:
         callback = PlannerTrainingCallback(make_trial_env=make_env)
-        model = make(env=env, planner_ways={}, planner_trial_episodes=2)
         recwarn.clear()
-        model.learn(60, callback=callback)
+        model.learn(8, callback=callback)
         found = [str(w.message) for w in recwarn if "training's own environment" in str(w.message)]
         assert bool(found) == (warned is not None) and all(re.search(warned, text) for text in found)
         assert not any("trial has failed" in str(w.message) for w in recwarn)
@@ -214,7 +214,7 @@ def test_where_environments_cannot_be_made_the_trainings_is_played_in_and_nothin
 
 def test_environments_that_cannot_be_closed_lose_no_trial(trained, monkeypatch):
     def make_env(n_envs):
-        env = DummyVecEnv([lambda: Monitor(pendulum(delay=(0, 2)))] * n_envs)
+        env = DummyVecEnv([lambda: Monitor(pendulum(8, (0, 2)))] * n_envs)
         monkeypatch.setattr(env, "close", lost)
         return env
 
@@ -232,13 +232,13 @@ def test_an_error_of_the_task_amid_the_trial_loses_no_planner(monkeypatch):
 
     monkeypatch.setattr(trial, "_play", lost)
     with pytest.warns(UserWarning, match="physics server lost"):
-        model = make(env=pendulum(), planner_trial_episodes=2).learn(60)
+        model = make(env=pendulum(), planner_trial_episodes=2).learn(25)
     assert model.policy.who_answers == "planner"
 
 
 def test_each_of_the_environments_plays_though_their_delays_differ():
     env = DummyVecEnv([lambda delay=delay: Monitor(pendulum(9, delay, 2)) for delay in range(3)])
-    model = make(env=env, planner_ways=OF_ONE_PLANNER).learn(60)
+    model = make(env=env, planner_ways=OF_ONE_PLANNER).learn(36)
     found = trial.play_trial(model, n_episodes=5)
     np.testing.assert_array_equal(found.ages, [0, 1, 2, 0, 1])
     assert sorted({len(returns) for returns in found.returns.values()}) == [3, 5]  # a quarter is less than one round
@@ -246,7 +246,7 @@ def test_each_of_the_environments_plays_though_their_delays_differ():
 
 def test_ages_that_change_within_an_episode_tell_nothing_of_it():
     """The planner and the expert then meet other ages in what is the same episode by name."""
-    model = make(env=pendulum(delay=UniformDelay(0, 2))).learn(60)
+    model = make(env=pendulum(delay=UniformDelay(0, 2))).learn(25)
     np.testing.assert_array_equal(trial.play_trial(model, n_episodes=4).ages, np.zeros(4))
 
 
@@ -286,7 +286,7 @@ class Noisy(Drift):
 
 
 def test_all_players_meet_the_same_starts_whatever_a_task_draws_in_between(monkeypatch):
-    model = make(env=DelayedObservationWrapper(Noisy(), 2), learning_starts=20, gradient_steps=1).learn(40)
+    model = make(env=DelayedObservationWrapper(Noisy(), 2), learning_starts=20, gradient_steps=1).learn(25)
     sign = {"planner": 1.0, "expert": -1.0}
     monkeypatch.setattr(
         model, "predict", lambda obs, **_: (np.full((1, 1), sign[model.policy.who_answers], np.float32), None)
@@ -316,7 +316,7 @@ def test_after_a_cut_episode_another_begins(monkeypatch):
 def test_episodes_may_end_above_their_monitor(task):
     """Where some fall, too, the Monitor sees those end and no others."""
     env = DelayedObservationWrapper(gym.wrappers.TimeLimit(Monitor(gym.make(task)), 9), 2)
-    found = trial.play_trial(make(env=env).learn(60), n_episodes=5)
+    found = trial.play_trial(make(env=env).learn(25), n_episodes=5)
     assert found.n_steps <= 2 * 5 * 9 and {len(returns) for returns in found.returns.values()} == {5}
     if task == "InvertedPendulum-v5":  # one a step
         assert all(0 < r <= 9 for returns in found.returns.values() for r in returns)
@@ -324,9 +324,10 @@ def test_episodes_may_end_above_their_monitor(task):
 
 def test_a_monitor_that_allows_no_early_reset_is_none_in_a_trial():
     env = Monitor(pendulum(), allow_early_resets=False)
-    model = make(env=env, planner_trial_episodes=1).learn(50)
+    model = make(env=env, planner_trial_episodes=1).learn(25)
+    trial.play_trial(model, n_episodes=1)  # an error of which is no warning
     assert not env.allow_early_resets
-    assert model.learn(50, reset_num_timesteps=False).num_timesteps == 100
+    assert model.learn(10, reset_num_timesteps=False).num_timesteps == 35
     env.reset()
     with pytest.raises(RuntimeError, match="before done"):
         env.reset()
@@ -334,7 +335,7 @@ def test_a_monitor_that_allows_no_early_reset_is_none_in_a_trial():
 
 def test_a_trial_can_be_stopped_and_the_planner_stays_trained(monkeypatch):
     monkeypatch.setattr(trainer_module, "GUESS_PASSES", 10_000)  # so that few rows do not end the guess sooner
-    model, asked = make(env=pendulum(), planner_ways={}).learn(60), []
+    model, asked = make(env=pendulum(), planner_ways={}).learn(25), []
     own, n_updates = model.policy.planner.config, 5 * GUESS_UPDATES_EACH + 5
 
     def should_stop():
@@ -348,33 +349,33 @@ def test_a_trial_can_be_stopped_and_the_planner_stays_trained(monkeypatch):
 
 
 def test_an_expert_without_updates_acts_on_no_guess():
-    model = make(env=pendulum(delay=(0, 2)), planner_ways={"actor": WAYS["actor"]}, learning_starts=100).learn(60)
+    model = make(env=pendulum(delay=(0, 2)), planner_ways={"actor": WAYS["actor"]}, learning_starts=100).learn(25)
     assert list(trial.play_trial(model, n_episodes=1).returns) == ["planner", "expert"]
 
 
 def test_the_trial_is_no_training(monkeypatch):
     """Neither steps, replay nor VecNormalize's statistics move, and learning starts anew afterwards."""
     env = VecNormalize(DummyVecEnv([lambda: Monitor(delayed())]), norm_obs_keys=["observation"])
-    model = make(env=env, planner_trial_episodes=0).learn(60)
+    model = make(env=env, planner_trial_episodes=0).learn(25)
     before = env.obs_rms["observation"].mean.copy(), env.ret_rms.var, model.replay_buffer.size()
     trial.play_trial(model, n_episodes=2)
     assert env.training
     np.testing.assert_array_equal(env.obs_rms["observation"].mean, before[0])
-    assert (env.ret_rms.var, model.replay_buffer.size(), model.num_timesteps) == (*before[1:], 60)
-    model.learn(20, reset_num_timesteps=False)
-    assert model.num_timesteps == 80
+    assert (env.ret_rms.var, model.replay_buffer.size(), model.num_timesteps) == (*before[1:], 25)
+    model.learn(10, reset_num_timesteps=False)
+    assert model.num_timesteps == 35
 
 
 def test_returns_are_in_the_task_s_own_rewards_without_a_monitor_too():
     env = VecNormalize(DummyVecEnv([lambda: delayed()]), norm_obs_keys=["observation"])
-    model = make(env=env).learn(60)
+    model = make(env=env).learn(25)
     np.testing.assert_allclose(trial.play_trial(model, n_episodes=2).returns["expert"], 12.0)  # 1 a step
     assert env.norm_reward
 
 
 def test_the_same_seed_gives_the_same_trial():
     def returns():
-        model = make(env=pendulum()).learn(60)
+        model = make(env=pendulum()).learn(25)
         return trial.play_trial(model, n_episodes=2).returns
 
     first, second = returns(), returns()
@@ -399,7 +400,7 @@ class Split(Drift):
 def test_an_episode_that_ends_before_an_action_shows_is_of_who_begins_episodes(delay, monkeypatch):
     """The planner is the better one in short episodes, and worse in long ones by less."""
     env = DelayedObservationWrapper(Split(truncates=False), delay)
-    model, sign = make(env=env, planner_ways={}).learn(80), {"planner": 1.0, "expert": -1.0}
+    model, sign = make(env=env, planner_ways={}).learn(40), {"planner": 1.0, "expert": -1.0}
     monkeypatch.setattr(
         model, "predict", lambda obs, **_: (np.full((1, 1), sign[model.policy.who_answers], np.float32), None)
     )
@@ -419,8 +420,8 @@ def test_ctrl_c_ends_the_trial_and_not_the_learning(monkeypatch, capsys):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(trial, "_play", interrupted)
-    model = make(env=pendulum(), planner_trial_episodes=2, planner_train_freq=50).learn(60)
-    assert model.policy.who_answers == "planner" and model._planner_trained_at == 60
+    model = make(env=pendulum(), planner_trial_episodes=2, planner_train_freq=25).learn(30)
+    assert model.policy.who_answers == "planner" and model._planner_trained_at == 30
     assert "The trial was interrupted" in capsys.readouterr().out
 
 
@@ -441,7 +442,7 @@ def test_a_trial_whose_rewards_are_no_numbers_chooses_nothing(monkeypatch):
     with pytest.warns(
         UserWarning, match="trial has failed, and the planner answers as it is: ValueError: A reward of the trial"
     ):
-        model = make(env=env, planner_trial_episodes=2).learn(60)
+        model = make(env=env, planner_trial_episodes=2).learn(25)
     assert model.policy.who_answers == "planner" and model.policy.planner.config.temperature == 0.5  # as made
 
 
@@ -449,15 +450,15 @@ def test_a_planner_of_one_age_is_not_tried_at_others_and_no_second_one_is_traine
     with pytest.warns(UserWarning, match="No trial is played, and the planner answers: .*mask='fixed'"):
         model = make(
             env=pendulum(max_delay=4), planner_kwargs={"mask": "fixed", "present": None}, planner_trial_episodes=2
-        ).learn(60)
+        ).learn(25)
     assert model.policy.who_answers == "planner"
     ways = {"paper": {"mask": "fixed", "present": "inpainted"}}
-    assert masks_of(make(env=pendulum(delay=(0, 2)), planner_ways=ways).learn(60)) == ["random"]
-    assert masks_of(make(env=pendulum(), planner_ways=ways).learn(60)) == ["random", "fixed"]
+    assert masks_of(make(env=pendulum(delay=(0, 2)), planner_ways=ways).learn(25)) == ["random"]
+    assert masks_of(make(env=pendulum(), planner_ways=ways).learn(25)) == ["random", "fixed"]
 
 
 def test_without_delay_no_way_is_played_twice():
     ways = {**OF_ONE_PLANNER, "own": {"temperature": 0.5}}
-    model = make(env=pendulum(delay=0), planner_ways=ways).learn(60)
+    model = make(env=pendulum(delay=0), planner_ways=ways).learn(25)
     names = [*trial.play_trial(model, 1).returns]
     assert "default" in names and "inpainted" not in names and "actor" not in names

@@ -59,7 +59,7 @@ def test_a_way_that_the_agent_cannot_have_is_refused_before_anything_is_learned(
 )
 def test_ways_of_several_planners_that_are_taken_are_trained_tried_and_loaded(kwargs, ways, delay, tmp_path):
     """Also where one contradicts the planner's own present."""
-    model = make(pendulum(delay=delay), planner_kwargs=kwargs, planner_ways=ways, planner_trial_episodes=1).learn(60)
+    model = make(pendulum(5, delay), planner_kwargs=kwargs, planner_ways=ways, planner_trial_episodes=1).learn(25)
     model.save(tmp_path / "agent.zip")
     assert SAID.load(tmp_path / "agent.zip", device="cpu").planner_ways == model.planner_ways
     assert {*model.planner_ways} == {*ways} and {*model.planner_ways["b"]} == {"mask", "present"}
@@ -69,10 +69,10 @@ def test_ways_of_several_planners_that_are_taken_are_trained_tried_and_loaded(kw
 def test_a_decision_of_one_s_own_is_kept_in_a_file_and_tried_against_all_ways(settings, tmp_path):
     """Some ways say otherwise of who decides, and where."""
     ways = {**WAYS, "inpainted": {"present": "inpainted"}}
-    model = make(env=pendulum(delay=(0, 2)), planner_ways=ways).learn(60)
+    model = make(env=pendulum(5, (0, 2)), planner_ways=ways, planner_gradient_steps=1).learn(25)
     model.set_planner(**settings)
     model.save(tmp_path / "agent.zip")
-    loaded = SAID.load(tmp_path / "agent.zip", env=pendulum(delay=(0, 2)), device="cpu")
+    loaded = SAID.load(tmp_path / "agent.zip", env=pendulum(5, (0, 2)), device="cpu")
     assert loaded.policy.planner.config == model.policy.planner.config
     assert loaded.planner_ways == {name: {"mask": "random", "present": "guessed", **way} for name, way in ways.items()}
     model.train_planner(trial_episodes=1)
@@ -82,5 +82,5 @@ def test_a_decision_of_one_s_own_is_kept_in_a_file_and_tried_against_all_ways(se
 def test_a_planner_that_knows_nothing_but_presents_is_tried_without_delay():
     """None of its ways has a twin that inpaints the present, which it cannot."""
     ways = {"own": {"sampling_steps": 1}}
-    model = make(pendulum(delay=0), planner_kwargs={"mask": "none"}, planner_ways=ways).learn(60)
+    model = make(pendulum(delay=0), planner_kwargs={"mask": "none"}, planner_ways=ways).learn(25)
     assert {*trial.play_trial(model, 1).returns} == {"planner", "own", "expert"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 import torch as th
@@ -15,6 +16,7 @@ BEHAVIOUR_GAIN, BEHAVIOUR_NOISE = th.tensor([[0.0, 0.2]]), 0.4  # a = -gain s + 
 STATE_DIM, ACTION_DIM = 2, 1
 
 
+@functools.cache
 def riccati(n_iterations: int = 500) -> tuple[th.Tensor, th.Tensor]:
     """Return the gain K of the best policy a = -K s and the matrix P of its cost-to-go s' P s."""
     P = Q.clone()

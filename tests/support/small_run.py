@@ -32,7 +32,7 @@ def write_run(
     """
     if cls is SAID:
         kwargs = {"planner_kwargs": TINY_PLANNER, "planner_gradient_steps": 2, "planner_trial_episodes": 0, **kwargs}
-    kwargs = {"learning_starts": 50, "buffer_size": 500, "device": "cpu", **kwargs}
+    kwargs = {"learning_starts": 50, "buffer_size": 500, "policy_kwargs": {"net_arch": [64]}, "device": "cpu", **kwargs}
     model = cls("MultiInputPolicy", DelayedObservationWrapper(gym.make(ENV), delay), seed=seed, **kwargs)
     model.learn(steps)
     model.save(folder / f"{ENV}.zip")

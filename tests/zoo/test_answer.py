@@ -7,27 +7,26 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
 pytest.importorskip("rl_zoo3")
 
 import small_agent
-from small_task import delayed
+from small_task import delayed, pendulum
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 from trained_run import ENV, PLANNER, train_run
 
-from sb3_said import SAID, DelayedObservationWrapper
+from sb3_said import SAID
 from sb3_said.evaluation.plots import plot_learning_curve
 from sb3_said.sac import StableSAC
 from sb3_said.zoo.answer import StoppableEvaluation, evaluate_answer
 from sb3_said.zoo.stopping import Stopping
 
-EVALUATED = ("--eval-freq", "100", "--eval-episodes", "2")
+EVALUATED = ("--eval-freq", "60", "--eval-episodes", "2")
 
 
 @pytest.fixture(scope="module")
@@ -48,10 +47,10 @@ def test_planner_and_expert_are_told_apart(logs: Path) -> None:
     (said,), (stable,) = ((logs / algo).iterdir() for algo in ("said", "stable"))
     expert, planner = returns_of(said / "expert" / "evaluations.npz"), returns_of(said / "evaluations.npz")
     # The expert is StableSAC, evaluated as it learns; the planner is evaluated when it has been trained.
-    assert expert == returns_of(stable / "evaluations.npz") and list(expert) == [100, 200]
+    assert expert == returns_of(stable / "evaluations.npz") and list(expert) == [60, 120]
     with np.load(said / "evaluations.npz") as file:
         assert file["answers"].tolist() == ["", "planner"]
-    assert list(planner) == [0, 200] and np.isnan(planner[0]).all() and np.isfinite(planner[200]).all()
+    assert list(planner) == [0, 120] and np.isnan(planner[0]).all() and np.isfinite(planner[120]).all()
     best, of_expert = (SAID.load(folder / "best_model.zip", device="cpu") for folder in (said, said / "expert"))
     assert best.policy.planner_is_trained and not of_expert.policy.planner_is_trained
     assert "eval/answer_mean_reward" in (said / "progress.csv").read_text().splitlines()[0]
@@ -69,7 +68,7 @@ def test_an_evaluation_whose_episode_may_have_no_end_is_warned_of(
     assert len(told) == (0 if has_an_end else 1)
 
 
-@pytest.mark.parametrize("max_steps", [1000, 150])
+@pytest.mark.parametrize("max_steps", [1000, 90])
 def test_the_plots_of_rl_zoo3_show_the_planner(
     max_steps: int, logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -83,10 +82,10 @@ def test_the_plots_of_rl_zoo3_show_the_planner(
     all_plots()
     shown = np.load(tmp_path / "out.pkl", allow_pickle=True)[f"{ENV}-delay2"]
     (said,), (stable,) = ((logs / algo).iterdir() for algo in ("said", "stable"))
-    last = 200 if max_steps == 1000 else 100
+    last = 120 if max_steps == 1000 else 60
     assert shown[f"STABLE-{logs}"]["last_evals"] == np.mean(returns_of(stable / "evaluations.npz")[last])
     # A planner that was trained after the steps shown is not there, and neither is its expert in its place.
-    expected = np.mean(returns_of(said / "evaluations.npz")[200 if max_steps == 1000 else 0])
+    expected = np.mean(returns_of(said / "evaluations.npz")[120 if max_steps == 1000 else 0])
     np.testing.assert_equal(shown[f"SAID-{logs}"]["last_evals"], expected)
 
 
@@ -96,7 +95,7 @@ def test_the_learning_curve_has_both(logs: Path) -> None:
     lines = {
         line.get_label().partition(",")[0]: line.get_xdata().tolist() for line in plot_learning_curve(said).lines[2:]
     }
-    assert lines == {"evaluation of the expert": [100, 200], "evaluation of the trained agent": [200]}
+    assert lines == {"evaluation of the expert": [60, 120], "evaluation of the trained agent": [120]}
 
 
 def test_a_later_planner_is_added_and_the_best_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -135,7 +134,7 @@ def test_the_episodes_are_the_same_whatever_was_evaluated_before(tmp_path: Path)
     """As a run that goes on after a stop has new environments."""
 
     def evaluation() -> EvalCallback:
-        return EvalCallback(Monitor(DelayedObservationWrapper(gym.make("Pendulum-v1"), 1)), n_eval_episodes=2)
+        return EvalCallback(Monitor(pendulum()), n_eval_episodes=2)
 
     used = evaluation()
     model = small_agent.make(used.eval_env, seed=3)

@@ -21,9 +21,9 @@ pytest.importorskip("rl_zoo3")
 from huggingface_hub import ModelCard
 from rl_zoo3 import exp_manager
 from rl_zoo3.utils import StoreDict
-from small_run import ENV, write_run
+from small_run import write_run
 from stable_baselines3.common.utils import LinearSchedule
-from trained_run import train_run
+from trained_run import ENV, train_run
 
 from sb3_said import SAID
 from sb3_said.zoo import card, decide, evaluate, over_delays

@@ -20,12 +20,12 @@ pytest.importorskip("rl_zoo3")
 
 from logged_task import LoggedTask
 from scipy.stats import chisquare
-from small_run import ENV, write_run
+from small_run import write_run
 from small_task import Drift
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from tqdm.auto import tqdm
-from trained_run import train_run
+from trained_run import ENV, train_run
 
 from sb3_said import DelayedObservationWrapper, DelayedSAC
 from sb3_said.offline import Dataset, load_dataset
@@ -35,7 +35,7 @@ from sb3_said.zoo.collect import NoisyAgent, Recorder
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_run(tmp_path_factory.mktemp("sadr") / f"{ENV}-delay2_1", DelayedSAC, 2)
+    return write_run(tmp_path_factory.mktemp("sadr") / f"{ENV}-delay2_1", DelayedSAC, 2, seed=2)
 
 
 def spaces_of(env_id: str) -> tuple[Any, Any]:
@@ -206,7 +206,7 @@ def test_an_agent_of_sb3_sees_what_vec_normalize_showed_it(
     place: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     env = VecNormalize(DummyVecEnv([lambda: gym.make(ENV)]))
-    model = SAC("MlpPolicy", env, buffer_size=100, learning_starts=10, device="cpu", seed=0).learn(60)
+    model = SAC("MlpPolicy", env, buffer_size=100, learning_starts=60, device="cpu", seed=0).learn(60)
     model.save(tmp_path / "sac.zip")
     if place is not None:
         (tmp_path / place).parent.mkdir(exist_ok=True)

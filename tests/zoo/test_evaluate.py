@@ -35,7 +35,7 @@ from sb3_said.zoo.runs import control_period, load_run
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_run(tmp_path_factory.mktemp("said") / f"{ENV}-delay2_1", SAID, 2, steps=100)
+    return write_run(tmp_path_factory.mktemp("said") / f"{ENV}-delay2_1", SAID, 2)
 
 
 def test_evaluate_measures_the_planner_and_the_expert(
@@ -61,7 +61,7 @@ def test_evaluate_measures_the_planner_and_the_expert(
                    "--plot", str(plot), "--device", "cpu"])  # fmt: skip
     document = json.loads((run / "evaluation.json").read_text())
     assert (document["algo"], document["env"], document["delay"]) == ("said", ENV, 2)
-    assert (document["seed"], document["n_episodes"], document["trained_steps"]) == (7, 3, 100)
+    assert (document["seed"], document["n_episodes"], document["trained_steps"]) == (7, 3, 60)
     assert [result["label"] for result in document["results"]] == ["planner", "expert"]
     assert document["origin"]["torch_threads"] == 1  # two would wait for each other on a busy machine
     instructions = document["origin"]["machine"].split(", ")[-1]  # by which sums round
@@ -134,7 +134,7 @@ def test_an_agent_that_reads_normalised_observations_is_not_played_without_their
         DummyVecEnv([lambda: DelayedObservationWrapper(gym.make(ENV), 1)]), norm_obs_keys=["observation"]
     )
     first, second = tmp_path / "first.zip", tmp_path / "second.zip"
-    DelayedSAC("MultiInputPolicy", env, learning_starts=10, buffer_size=100, device="cpu").learn(20).save(first)
+    DelayedSAC("MultiInputPolicy", env, learning_starts=20, buffer_size=100, device="cpu").learn(20).save(first)
     DelayedSAC.load(first, device="cpu").save(second)  # without an environment it remembers, too
     for file in (first, second):
         with pytest.raises(ValueError, match=f"{file.stem}.normalize.zip is missing"):
@@ -291,8 +291,8 @@ def test_logs_that_a_kill_has_cut_are_drawn_as_far_as_they_go(tmp_path: Path) ->
     np.testing.assert_array_equal(episodes.get_xydata(), [[12, 5], [25, 7]])
 
 
-def test_a_run_that_stopped_before_its_planner_says_so(tmp_path: Path) -> None:
-    folder = write_run(tmp_path, SAID, 2)
+def test_a_run_that_stopped_before_its_planner_says_so(run: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(run, tmp_path / "run"))
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message=".*stopped after")
         model = load_run(folder).model
@@ -345,8 +345,7 @@ def test_enjoy_says_what_is_wrong(
     assert exit_info.value.code == 2 and message in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("own", [25, 125, None])
-@pytest.mark.parametrize("fps", [10, 12, 25, 30, 60, 125])
+@pytest.mark.parametrize(("fps", "own"), [(12, 25), (25, 25), (60, 25), (30, 125), (60, 125), (125, 125), (12, None)])
 @pytest.mark.parametrize("suffix", [".gif", ".mp4"])
 def test_video_plays_in_real_time(fps: int, own: int | None, suffix: str, tmp_path: Path) -> None:
     imageio = pytest.importorskip("imageio.v3")
@@ -355,7 +354,7 @@ def test_video_plays_in_real_time(fps: int, own: int | None, suffix: str, tmp_pa
         metadata = {"render_fps": own}
 
         def render(self) -> np.ndarray:
-            return np.random.default_rng(video._steps).integers(0, 255, (32, 32, 3), np.uint8)
+            return np.full((16, 16, 3), video._steps % 256, np.uint8)
 
     video = enjoy.Video(tmp_path / "sub" / f"film{suffix}", fps)
     for _ in range(2 * (own or fps)):  # 2 seconds

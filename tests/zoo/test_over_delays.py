@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import json
+import multiprocessing
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import warnings
+from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import replace
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -22,8 +23,9 @@ import pytest
 
 pytest.importorskip("rl_zoo3")
 
+from forked import begin, run_script
 from scipy.stats import ttest_1samp
-from small_run import ENV, write_run
+from small_run import ENV, TINY_PLANNER, write_run
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
@@ -38,12 +40,27 @@ from sb3_said.zoo.runs import load_run
 
 @pytest.fixture(scope="module")
 def said(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_run(tmp_path_factory.mktemp("said") / f"{ENV}-delay2_1", SAID, 2)
+    planner = {**TINY_PLANNER, "first_guess": "none"}  # which each cell would load
+    return write_run(tmp_path_factory.mktemp("said") / f"{ENV}-delay2_1", SAID, 2, planner_kwargs=planner)
 
 
 @pytest.fixture(scope="module")
 def sadr(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_run(tmp_path_factory.mktemp("sadr") / f"{ENV}-delay1_1", DelayedSAC, 1)
+
+
+@pytest.fixture(scope="module")
+def seeds(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Training seeds of the same setting, in folders of one name."""
+    return [write_run(tmp_path_factory.mktemp("seed") / "sadr" / "run", DelayedSAC, 1, seed=seed) for seed in (1, 2)]
+
+
+@pytest.fixture(scope="module")
+def changed(seeds: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One of them, of a task that it changes."""
+    run = Path(shutil.copytree(seeds[0], tmp_path_factory.mktemp("changed") / "run"))
+    replace(Record.read(run), env_kwargs={"reset_noise_scale": 0.2}).write(run)
+    return run
 
 
 def play(file: Path, runs: list[str | Path], delays: list[str], *more: str) -> dict[str, Any]:
@@ -242,11 +259,10 @@ def test_cells_of_another_version_are_told_in_one_line(tmp_path: Path, capsys) -
     assert "is no file of over-delays" in capsys.readouterr().err
 
 
-def test_a_changed_agent_is_played_again(said: Path, tmp_path: Path, monkeypatch, capsys) -> None:
-    file, folder = tmp_path / "out.json", tmp_path / "d1"
-    write_run(folder, DelayedSAC, 1)
+def test_a_changed_agent_is_played_again(said: Path, seeds: list[Path], tmp_path: Path, monkeypatch, capsys) -> None:
+    file, folder = tmp_path / "out.json", Path(shutil.copytree(seeds[0], tmp_path / "d1"))
     old = play(file, [f"a={said}", f"b={folder}"], ["0", "1"])
-    write_run(folder, DelayedSAC, 1, seed=5)
+    shutil.copytree(seeds[1], folder, dirs_exist_ok=True)
     played = count_plays(monkeypatch)
     assert "dropped" not in capsys.readouterr().out
     new = play(file, [f"b={folder}"], ["1"])
@@ -257,25 +273,26 @@ def test_a_changed_agent_is_played_again(said: Path, tmp_path: Path, monkeypatch
     )
     assert by_cell(new)["b", 1] != by_cell(old)["b", 1]
     monkeypatch.chdir(tmp_path)
-    write_run(folder, DelayedSAC, 1, seed=6)
+    shutil.copytree(seeds[0], folder, dirs_exist_ok=True)
     again = play(file, ["b=d1"], ["1"])  # the same by another path
     assert "1 results of b are dropped: " in capsys.readouterr().out and [*by_cell(again)].count(("b", 1)) == 1
     assert by_cell(new)["a expert", 0] == by_cell(old)["a expert", 0]
 
 
-def test_an_agent_by_another_label_stays_in_the_row_of_its_seeds(sadr: Path, tmp_path: Path) -> None:
-    other = write_run(tmp_path / "run", DelayedSAC, 1, seed=5)
-    seeds = play(tmp_path / "out.json", [f"both={sadr}", f"both={other}"], ["0"])
-    again = play(tmp_path / "out.json", [f"alone={other}"], ["0"])
+def test_an_agent_by_another_label_stays_in_the_row_of_its_seeds(seeds: list[Path], tmp_path: Path) -> None:
+    row = play(tmp_path / "out.json", [f"both={run}" for run in seeds], ["0"])
+    again = play(tmp_path / "out.json", [f"alone={seeds[1]}"], ["0"])
     alone, *both = again["cells"]
-    assert both == seeds["cells"] and alone == {**both[1], "agent": "alone"}
+    assert both == row["cells"] and alone == {**both[1], "agent": "alone"}
 
 
-def test_paths_are_of_the_results_folder_wherever_a_call_is_made(sadr: Path, tmp_path: Path, monkeypatch) -> None:
+def test_paths_are_of_the_results_folder_wherever_a_call_is_made(
+    sadr: Path, seeds: list[Path], tmp_path: Path, monkeypatch
+) -> None:
     run, file = tmp_path / "logs" / "run", Path("results", "out.json")
     monkeypatch.chdir(tmp_path)
-    for folder, seed in ((tmp_path, 5), (tmp_path / "logs", 6)):  # a run that goes on between two calls
-        write_run(run, DelayedSAC, 1, seed=seed)
+    for folder, seed in zip((tmp_path, tmp_path / "logs"), seeds, strict=True):  # a run that goes on between two calls
+        shutil.copytree(seed, run, dirs_exist_ok=True)
         monkeypatch.chdir(folder)
         document = play(Path(os.path.relpath(tmp_path / file)), [f"a={os.path.relpath(run)}", f"b={sadr}"], ["0"])
     paths = [Path(cell["file"]) for cell in document["cells"]]
@@ -283,13 +300,12 @@ def test_paths_are_of_the_results_folder_wherever_a_call_is_made(sadr: Path, tmp
     assert Results(Path("..", file)).cells[0].file == str(Path("run", f"{ENV}.zip"))
 
 
-def test_an_agent_of_another_folder_is_no_changed_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_agent_of_another_folder_is_no_changed_one(seeds: list[Path], tmp_path: Path, monkeypatch) -> None:
     """Both are named by the same relative path, and may have the same label: then they are training seeds."""
     for labels in (("first", "second"), ("same", "same")):
         file = tmp_path / f"{labels[0]}.json"
-        for seed, label in enumerate(labels):
-            write_run(tmp_path / str(seed) / "run", DelayedSAC, 1, seed=seed)
-            monkeypatch.chdir(tmp_path / str(seed))
+        for seed, label in zip(seeds, labels, strict=True):
+            monkeypatch.chdir(seed.parent)
             document = play(file, [f"{label}=run"], ["0"])
         assert [cell["agent"] for cell in document["cells"]] == [*reversed(labels)]
 
@@ -317,11 +333,10 @@ def test_calls_that_add_to_one_file_at_a_time_lose_nothing(said: Path, sadr: Pat
     assert by_cell(document).items() <= by_cell(alone).items()
 
 
-def test_runs_of_one_folder_name_need_labels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    runs = [write_run(tmp_path / name / "said" / "run_1", DelayedSAC, 1, seed=i) for i, name in enumerate("ab")]
+def test_runs_of_one_folder_name_need_labels(seeds: list[Path], tmp_path: Path, capsys) -> None:
     with pytest.raises(SystemExit):
-        play(tmp_path / "out.json", [*runs], ["1"])
-    assert f"would both be called said/run_1: give each its own label, as in LABEL={runs[1]}" in capsys.readouterr().err
+        play(tmp_path / "out.json", [*seeds], ["1"])
+    assert f"would both be called sadr/run: give each its own label, as in LABEL={seeds[1]}" in capsys.readouterr().err
 
 
 def test_an_agent_of_a_plain_run_is_its_file(said: Path, tmp_path: Path) -> None:
@@ -357,32 +372,35 @@ def test_a_table_without_a_number_has_no_interval_and_no_plot(
     assert "Nothing was played that" in out and "95 %" not in out and not (tmp_path / "plot.png").exists()
 
 
-def test_workers_end_with_a_killed_command() -> None:
-    code = f"""if __name__ == "__main__":
-    import multiprocessing, os, signal
-    from concurrent.futures import ProcessPoolExecutor
-    from {over_delays.__name__} import begin_worker
-    spawn = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(1, spawn, initializer=begin_worker, initargs=(1,))
+def die_beside_a_worker(_: Connection) -> None:
+    """Begin a worker, which is forked and so holds the pipe, too, and be killed."""
+    fork = multiprocessing.get_context("fork")
+    pool = ProcessPoolExecutor(1, fork, initializer=over_delays.begin_worker, initargs=(1,))
     assert pool.submit(os.getpid).result() != os.getpid()
     os.kill(os.getpid(), signal.SIGKILL)
-"""
-    # The worker holds the pipe, too, so reading it ends with the worker
-    killed = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, timeout=120)
-    assert killed.returncode == -signal.SIGKILL
+
+
+def test_workers_end_with_a_killed_command(tmp_path: Path) -> None:
+    reader, writer = multiprocessing.Pipe(duplex=False)
+    killed = begin(output := tmp_path / "output.txt", die_beside_a_worker, writer)
+    writer.close()
+    assert reader.poll(240), "the worker goes on"  # reading the pipe ends with its last writer
+    killed.join()
+    assert killed.exitcode == -signal.SIGKILL, output.read_text()
 
 
 @pytest.mark.parametrize("starts", [False, True])
-def test_ctrl_c_ends_workers_amid_their_cells(starts: bool, said: Path, tmp_path: Path) -> None:
+def test_ctrl_c_ends_workers_amid_their_cells(starts: bool, sadr: Path, tmp_path: Path) -> None:
     """A terminal sends it to all: workers would go on with the next cells, and the command wait for them.
 
     Amid the start of one, too, which without what it is to do would tell so in a traceback.
     """
-    words = ["--delays", "0", "1", "--workers", "2", "--device", "cpu", "--json", str(tmp_path / "out.json")]
+    delays = ["--delays", "0", "1", "UniformDelay(0, 1)", "EpisodeDelay(0, 1)"]
+    words = [str(sadr), *delays, "--workers", "2", "--device", "cpu", "--json", str(tmp_path / "out.json")]
     code = f"""
 import os, time
 from multiprocessing import forkserver
-from signal import SIGINT, default_int_handler, signal
+from signal import SIGINT
 from sb3_said.zoo import over_delays
 
 def begin(*_):
@@ -396,26 +414,27 @@ def start(fds, start=forkserver.connect_to_new_process):
     return made
 
 if __name__ == "__main__":
-    signal(SIGINT, default_int_handler)  # which a background job of a shell ignores
     over_delays.play, forkserver.connect_to_new_process = begin, start
-    over_delays.main({[f"x={said}", *words]!r})
+    over_delays.main({words!r})
 """
     (script := tmp_path / "command.py").write_text(code)
-    command, pipe = [sys.executable, "-u", str(script)], subprocess.PIPE
-    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, start_new_session=True) as process:
-        assert process.stdout is not None
-        try:
-            while not starts and (line := process.stdout.readline()) != "begun\n":
+    os.mkfifo(output := tmp_path / "output")
+    process = begin(output, run_script, script, [])
+    assert process.pid is not None
+    try:
+        with output.open() as pipe:  # which ends with the last of the processes
+            while not starts and "begun" not in (line := pipe.readline()):
                 assert line, "it has ended"
             if not starts:
                 os.killpg(process.pid, signal.SIGINT)
-            printed, told = process.communicate(timeout=120)
-        finally:
-            with suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-    assert process.returncode == 130 and "Interrupted. Give the same command again" in told, told
-    n_begun = printed.count("begun") + (not starts)  # one was read above
-    assert "Traceback" not in told and n_begun <= 2, printed  # of the four cells, one each worker
+            shown = pipe.read()
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+    process.join()
+    assert process.exitcode == 130 and "Interrupted. Give the same command again" in shown, shown
+    n_begun = shown.count("begun") + (not starts)  # one was read above
+    assert "Traceback" not in shown and n_begun <= 2, shown  # of the four cells, one each worker
 
 
 def test_a_delay_written_in_two_ways_is_played_once(
@@ -485,13 +504,12 @@ def test_an_agent_that_changes_amid_a_call_ends_it(
 
 
 def test_training_seeds_of_one_label_are_one_row(
-    sadr: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    sadr: Path, seeds: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """They play every delay; the intervals are over the seeds, by Student's t, also when the file is shown again."""
     pytest.importorskip("matplotlib")
-    seeds = [sadr, *(write_run(tmp_path / f"seed{seed}", DelayedSAC, 1, seed=seed) for seed in (1, 2))]
     file, plot = tmp_path / "out.json", tmp_path / "plot.png"
-    runs = [f"any={run}" for run in seeds]
+    runs = [f"any={run}" for run in (sadr, *seeds)]
     document = play(file, [*runs, f"one={sadr}"], ["0", "1"])
     capsys.readouterr()
     titles: list[str] = []
@@ -522,8 +540,8 @@ def test_training_seeds_of_one_label_are_one_row(
     assert titles == [f"{ENV} under delay: means of 3 episodes, 95 % intervals"]
 
 
-def test_other_statistics_of_vec_normalize_make_another_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = write_run(tmp_path / "run", DelayedSAC, 1)
+def test_other_statistics_of_vec_normalize_make_another_agent(sadr: Path, tmp_path: Path, monkeypatch) -> None:
+    run = Path(shutil.copytree(sadr, tmp_path / "run"))
     env = VecNormalize(DummyVecEnv([lambda: DelayedObservationWrapper(gym.make(ENV), 1)]), norm_obs=False)
     agent = run / f"{ENV}.zip"
     played = count_plays(monkeypatch)
@@ -593,12 +611,10 @@ def test_runs_of_two_tasks_are_refused(sadr: Path, tmp_path: Path, capsys: pytes
 
 
 def test_no_reference_return_is_of_a_changed_task(
-    sadr: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    sadr: Path, changed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(REFERENCE_RETURNS, "invertedpendulum", (0.0, 1000.0))
-    other = write_run(tmp_path / "other", DelayedSAC, 2, seed=9)
-    Record("sadr", ENV, 9, 2, env_kwargs={"reset_noise_scale": 0.2}).write(other)
-    for words in ([f"plain={sadr}", f"changed={other}"], []):  # and where a file alone says so
+    for words in ([f"plain={sadr}", f"changed={changed}"], []):  # and where a file alone says so
         over_delays.main(
             [*words, *("--delays 1 --episodes 2 --json".split() if words else ["--json"]), str(tmp_path / "o.json")]
         )
@@ -608,7 +624,7 @@ def test_no_reference_return_is_of_a_changed_task(
         assert "| plain" in scores and "| changed" not in scores
     over_delays.main(["--rows", "changed", "--json", str(tmp_path / "o.json")])
     assert "normalised score" not in capsys.readouterr().out  # not even its header
-    assert (load_run(sadr).scored_task, load_run(other).scored_task) == (ENV, "")
+    assert (load_run(sadr).scored_task, load_run(changed).scored_task) == (ENV, "")
 
 
 def test_an_agent_that_reads_no_age_is_told_none_wrong(said: Path, tmp_path: Path) -> None:
@@ -623,14 +639,12 @@ def test_an_agent_that_reads_no_age_is_told_none_wrong(said: Path, tmp_path: Pat
 
 
 def test_runs_of_a_task_that_one_of_them_changes_are_no_seeds_of_one_setting(
-    sadr: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    sadr: Path, changed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    other = write_run(tmp_path / "other", DelayedSAC, 2, seed=9)
-    Record("sadr", ENV, 9, 2, env_kwargs={"reset_noise_scale": 0.2}).write(other)
     with pytest.raises(SystemExit):
-        play(tmp_path / "out.json", [f"x={sadr}", f"x={other}"], ["2"])
+        play(tmp_path / "out.json", [f"x={sadr}", f"x={changed}"], ["1"])
     assert "The runs of x change their task in different ways" in capsys.readouterr().err
-    play(tmp_path / "out.json", [f"x={sadr}", f"y={other}"], ["2"])
+    play(tmp_path / "out.json", [f"x={sadr}", f"y={changed}"], ["1"])
     assert 'not the same task, beside the delay: x has {}; y has {"env_kwargs"' in capsys.readouterr().out
 
 

@@ -14,8 +14,8 @@ import pytest
 pytest.importorskip("rl_zoo3")
 
 from rl_zoo3.wrappers import TimeFeatureWrapper
-from small_task import Drift
-from trained_run import PLANNER, train_here
+from small_task import Drift, pendulum
+from trained_run import ENV, PLANNER, report_quickly, train_here
 
 from sb3_said import DelayedObservationWrapper, DelayedSAC
 from sb3_said.zoo import enjoy, evaluate, manager, over_delays, train, tune
@@ -97,7 +97,7 @@ def test_a_task_may_have_a_dot_in_its_name(tmp_path: Path) -> None:
 
 
 def test_a_task_registered_with_its_delay_keeps_it(tmp_path: Path) -> None:
-    gym.register("Late-v0", lambda: DelayedObservationWrapper(gym.make("Pendulum-v1"), delay=1, max_delay=2))
+    gym.register("Late-v0", lambda: pendulum(20, delay=1, max_delay=2))
     try:
         train_here(tmp_path, f"--algo sadr --env Late-v0 {QUICK}")
         run = tmp_path / "sadr" / "Late-v0-seed3_1"
@@ -105,7 +105,7 @@ def test_a_task_registered_with_its_delay_keeps_it(tmp_path: Path) -> None:
         for path in (run, copy):
             for delay in (None, 1):
                 opened = load_run(path, "sadr", "Late-v0", delay, device="cpu")
-                assert opened.info["delay"] == 1 and opened.play(1, seed=0).lengths.tolist() == [200]
+                assert opened.info["delay"] == 1 and opened.play(1, seed=0).lengths.tolist() == [20]
             with pytest.raises(ValueError, match="Late-v0 is registered with a delay of its own, 1, and can be played"):
                 load_run(path, "sadr", "Late-v0", 2, device="cpu")
         words = [str(run), "--delays", "1", "2", "--episodes", "2", "--json", str(tmp_path / "over.json")]
@@ -139,13 +139,13 @@ def test_an_action_delay_of_the_task_counts_among_what_it_can_play(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     params = ["-params", f"env_wrapper:[{{{WRAPPER!r}: {{'delay': 2, 'action_delay': 1}}}}]"]
-    train_here(tmp_path, f"--algo sadr --env Pendulum-v1 {QUICK}", *params)
-    run, few = tmp_path / "sadr" / "Pendulum-v1-seed3_1", ["--episodes", "1", "--device", "cpu"]
+    train_here(tmp_path, f"--algo sadr --env {ENV} {QUICK}", *params)
+    run, few = tmp_path / "sadr" / f"{ENV}-seed3_1", ["--episodes", "1", "--device", "cpu"]
     over_delays.main([str(run), *few, "--delays", "0", "2", "3", "--json", str(tmp_path / "over.json")])
     shown = capsys.readouterr().out
     assert "2 of 3 cells to play" in shown
     assert "cannot play delay 3: it was built for delays 0..3, and its task delays actions by 1" in shown
-    agent = run / "Pendulum-v1.zip"
+    agent = run / f"{ENV}.zip"
     (copy := tmp_path / "alone.zip").write_bytes(agent.read_bytes())  # which does not know of the task's action delay
     over_delays.main([str(copy), *few, "--algo", "sadr", "--delays", "2", "--json", str(tmp_path / "over.json")])
     assert "1 of 1 cells to play" in capsys.readouterr().out
@@ -171,6 +171,7 @@ def test_a_run_remembers_the_package_of_its_task(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     forget_mine(monkeypatch)
+    report_quickly(monkeypatch)
     train_here(tmp_path, f"--algo said --env Mine-v0 --gym-packages mine --delay 1 {QUICK}",
                "--env-kwargs", "length:5", "-params", *PLANNED)  # fmt: skip
     run = tmp_path / "said" / "Mine-v0-delay1-seed3_1"

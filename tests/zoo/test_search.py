@@ -186,10 +186,7 @@ def test_a_journal_needs_no_symbolic_link(tmp_path: Path, monkeypatch: pytest.Mo
         raise OSError(1314, "A required privilege is not held by the client")  # Windows says so to most users
 
     monkeypatch.setattr("os.symlink", refused)
-    assert cells(run(tmp_path, Agent(lambda temperature, **_: temperature), [0.0, 1.0], (5,), "")) == [
-        (0.0, 5),
-        (1.0, 5),
-    ]
+    assert cells(run(tmp_path, Agent(lambda temperature, **_: temperature), [0.0, 1.0])) == [(0.0, 5), (1.0, 5)]
 
 
 @pytest.mark.parametrize("storage", ["", "sqlite:///{}/study.db"])

@@ -21,7 +21,7 @@ import gymnasium as gym
 from forked import begin, run_script
 from kill import Killed
 from stable_baselines3.common.callbacks import EvalCallback
-from trained_run import NETWORKS, train_here
+from trained_run import ENV, NETWORKS, PLANNER, config_of, same_agents, train_here
 
 from sb3_said import SAID, DelayedSAC, StableSAC
 from sb3_said.delays.space import ages_of
@@ -38,13 +38,12 @@ from sb3_said.zoo.record import ENDED_NAME, Record
 from sb3_said.zoo.runs import load_run
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
-TINY_PLANNER = "planner_kwargs:dict(d_model=32,depth=1,horizon=3,batch_size=16,precision='float32')"
-ENV = "InvertedPendulum-v5"
+TINY_PLANNER = f"planner_kwargs:{PLANNER}"
 
 
 def arguments(folder: Path) -> list[str]:
-    base = f"--algo said --env {ENV} --delay 2 --preset smoke -n 200 --seed 3 --num-threads 1 --verbose 0"
-    options = "--eval-freq 100 --eval-episodes 2 --checkpoint-freq 50 --device cpu"
+    base = f"--algo said --env {ENV} --delay 2 --preset smoke -n 120 --seed 3 --num-threads 1 --verbose 0"
+    options = "--eval-freq 60 --eval-episodes 1 --checkpoint-freq 30 --device cpu"
     params = ["learning_starts:75", "planner_gradient_steps:10", "planner_newest_fraction:1.0", TINY_PLANNER, NETWORKS]
     return [*base.split(), *options.split(), "-f", str(folder), "-params", *params]
 
@@ -52,17 +51,6 @@ def arguments(folder: Path) -> list[str]:
 def run_of(folder: Path) -> Path:
     """Return the run of ``arguments``."""
     return folder / "said" / f"{ENV}-delay2-seed3_1"
-
-
-def config_of(run: Path) -> dict[str, Any]:
-    """Return the hyper-parameters that a run was last trained with."""
-    (file,) = run.glob("*/config.yml")
-    return dict(yaml.load(file.read_text(), Loader=yaml.UnsafeLoader))
-
-
-def assert_same_agents(left: Path, right: Path) -> None:
-    one, other = (SAID.load(run / f"{ENV}.zip").get_parameters()["policy"] for run in (left, right))
-    assert all((one[key] == other[key]).all() for key in one)
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +62,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_run_leaves_an_agent_that_answers_with_its_planner(finished: Path) -> None:
     model = SAID.load(finished / f"{ENV}.zip")
-    assert model.num_timesteps == 200
+    assert model.num_timesteps == 120
     assert model.policy.planner_is_trained
     assert model.policy.max_delay == 2
     assert load_run(finished, device="cpu").info["delay"] == 2
@@ -98,7 +86,7 @@ def test_a_trial_plays_in_several_environments_where_the_run_may_make_more_than_
     train.main([*arguments(tmp_path), "planner_trial_episodes:3", *more])
     assert {*map(str, played)} == {str((n_envs, [2]))}
     rows = (run_of(tmp_path) / "0.monitor.csv").read_text().splitlines()[2:]
-    assert sum(int(row.split(",")[1]) for row in rows) <= 200  # of the training's steps, and none of the trial's
+    assert sum(int(row.split(",")[1]) for row in rows) <= 120  # of the training's steps, and none of the trial's
 
 
 def test_a_finished_run_has_nothing_left_to_do_and_else_resumes_to_the_same_agent(
@@ -111,7 +99,7 @@ def test_a_finished_run_has_nothing_left_to_do_and_else_resumes_to_the_same_agen
     assert {file: file.stat().st_mtime_ns for file in copy.rglob("*")} == before
     (copy / ENDED_NAME).unlink()  # as of one that was killed after its last checkpoint
     train.main(["--resume", str(copy)])
-    assert_same_agents(finished, copy)
+    assert same_agents(finished, copy)
     assert (copy / ENDED_NAME).is_file()
     (copy / ENDED_NAME).unlink()
     (copy / "checkpoint.zip").write_bytes(b"half of one")
@@ -130,9 +118,9 @@ def test_a_trial_that_has_failed_is_played_by_a_resume_with_as_many_steps(
         with pytest.warns(UserWarning, match="The trial has failed.*no simulator.*--resume with as many steps"):
             train.main(arguments(tmp_path))
     run = run_of(tmp_path)
-    train.main(["--resume", str(run), "-n", "200"])
-    assert "trial/way" in (run / "progress_200.csv").read_text()
-    assert_same_agents(finished, run)
+    train.main(["--resume", str(run), "-n", "120"])
+    assert "trial/way" in (run / "progress_120.csv").read_text()
+    assert same_agents(finished, run)
 
 
 def test_a_killed_run_goes_on_from_its_checkpoint_twice_alike(
@@ -140,7 +128,7 @@ def test_a_killed_run_goes_on_from_its_checkpoint_twice_alike(
 ) -> None:
     def save(callback: TrainingCheckpointCallback, original: Any = TrainingCheckpointCallback.save) -> None:
         original(callback)
-        if callback.model.num_timesteps >= 150:
+        if callback.model.num_timesteps >= 90:
             raise Killed
 
     monkeypatch.setattr(TrainingCheckpointCallback, "save", save)
@@ -148,14 +136,14 @@ def test_a_killed_run_goes_on_from_its_checkpoint_twice_alike(
         train.main(arguments(tmp_path))
     monkeypatch.undo()
     folder = run_of(tmp_path)
-    assert load_tree(folder / "checkpoint.zip")["counters"]["num_timesteps"] == 150
+    assert load_tree(folder / "checkpoint.zip")["counters"]["num_timesteps"] == 90
     copy = Path(shutil.copytree(folder, tmp_path / "copy"))
     for each in (folder, copy):
         train.main(["--resume", str(each)])
-        assert "at step 150" in capsys.readouterr().out
-    assert_same_agents(folder, copy)
-    assert SAID.load(folder / f"{ENV}.zip").num_timesteps == 200
-    assert np.load(folder / "expert" / "evaluations.npz")["timesteps"].tolist() == [100, 200]
+        assert "at step 90" in capsys.readouterr().out
+    assert same_agents(folder, copy)
+    assert SAID.load(folder / f"{ENV}.zip").num_timesteps == 120
+    assert np.load(folder / "expert" / "evaluations.npz")["timesteps"].tolist() == [60, 120]
 
 
 def train_killed_amid_updates(folder: Path) -> None:
@@ -180,25 +168,25 @@ def test_a_run_killed_amid_the_planners_updates_ends_as_if_it_was_not(finished: 
     folder = run_of(tmp_path)
     assert load_tree(folder / "planner_checkpoint.zip")["trainer"]["n_updates"] == 5
     train.main(["--resume", str(folder)])
-    assert_same_agents(finished, folder)
+    assert same_agents(finished, folder)
 
 
 def test_a_given_agent_learns_as_many_steps_as_a_new_one(tmp_path: Path) -> None:
-    command, name = "--algo said --env Pendulum-v1 --delay 1 --preset smoke -n 150 --seed 3", "Pendulum-v1.zip"
+    command, name = "--algo said --env Pendulum-v1 --delay 1 --preset smoke -n 120 --seed 3", "Pendulum-v1.zip"
     own = ["learning_starts:100", "planner_gradient_steps:2", "planner_trial_episodes:0"]
     params = ["-params", *own, TINY_PLANNER, NETWORKS]
     first, second = (tmp_path / "said" / f"Pendulum-v1-delay1-seed3_{k}" for k in (1, 2))
     train_here(tmp_path, command, *params)
     train_here(tmp_path, command, "-i", first / name, *params)
     before, after = (SAID.load(run / name) for run in (first, second))
-    assert before.num_timesteps == after.num_timesteps == 150 and after.policy.planner_is_trained
+    assert before.num_timesteps == after.num_timesteps == 120 and after.policy.planner_is_trained
     left, right = (agent.policy.actor.state_dict() for agent in (before, after))
     assert not all((left[key] == right[key]).all() for key in left)
     assert (second / "progress.csv").exists()  # the log of a new run, not of a resumed one
     (first / name).unlink()  # the run has a copy of its own
-    train.main(["--resume", str(second), "-n", "170"])  # a resume does go on from where the run was
-    assert SAID.load(second / name).num_timesteps == 170
-    assert (second / "progress_150.csv").exists()
+    train.main(["--resume", str(second), "-n", "130"])  # a resume does go on from where the run was
+    assert SAID.load(second / name).num_timesteps == 130
+    assert (second / "progress_120.csv").exists()
 
 
 def test_a_resume_keeps_what_it_is_not_told_to_change(tmp_path: Path) -> None:
@@ -216,17 +204,17 @@ def test_a_resume_keeps_what_it_is_not_told_to_change(tmp_path: Path) -> None:
 
 
 def test_a_resume_says_how_a_planner_of_its_checkpoint_decides(tmp_path: Path) -> None:
-    train.main([*arguments(tmp_path), "planner_train_freq:100", "planner_trial_episodes:0"])
+    train.main([*arguments(tmp_path), "planner_train_freq:80", "planner_trial_episodes:0"])
     run = run_of(tmp_path)
     train.main(["--resume", str(run), "-params", "planner_kwargs:{'temperature': 3.0, 'n_candidates': 2}"])
     for _ in range(2):  # and no other, as long as nothing else is said
         planner = SAID.load(run / f"{ENV}.zip", device="cpu").planner_kwargs
         assert (planner["temperature"], planner["n_candidates"], planner["depth"]) == (3.0, 2, 1)
-        train.main(["--resume", str(run), "-n", "240"])
+        train.main(["--resume", str(run), "-n", "160"])
     before = {file: file.read_bytes() for file in run.iterdir() if file.is_file()}
     other = "planner_kwargs:{'mask': 'own', 'present': 'inpainted'}"
     with pytest.raises(SystemExit, match="goes on with mask='random', as its planner was trained, got 'own'"):
-        train.main(["--resume", str(run), "-n", "280", "-params", other])
+        train.main(["--resume", str(run), "-n", "200", "-params", other])
     assert {file: file.read_bytes() for file in run.iterdir() if file.is_file()} == before
 
 
@@ -256,28 +244,23 @@ def test_a_resume_takes_no_setting_that_the_run_never_had(tmp_path: Path) -> Non
     assert config_of(run) == {**before, "tau": 0.02}
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--eval-freq -1", "as the run began, with evaluations: --eval-freq -1 does not"),
-        ("-params planner_gradient_steps:11", "gradient_steps was 10"),
-        ("-n 240 -params n_envs:3", "goes on with n_envs=1, as the replay has them, got 3"),
-    ],
-)
-def test_a_refused_resume_leaves_the_run_as_it_was(
-    words: str, message: str, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_refused_resume_leaves_the_run_as_it_was(finished: Path, tmp_path: Path, capsys: Any) -> None:
     copy = Path(shutil.copytree(finished, tmp_path / "copy"))
     before = json.loads((copy / "run.json").read_text())
-    with pytest.raises(SystemExit) as stop:
-        train.main(["--resume", str(copy), *words.split()])
-    assert message in f"{stop.value} {capsys.readouterr().err}"
-    assert json.loads((copy / "run.json").read_text()) == before
-    train.main(["--resume", str(copy)])
-    assert "nothing is left to do" in capsys.readouterr().out
-    assert_same_agents(finished, copy)
-    train.main(["--resume", str(copy), "-n", "240"])
-    assert SAID.load(copy / f"{ENV}.zip").num_timesteps == 240 and (copy / ENDED_NAME).is_file()
+    for words, message in (
+        ("--eval-freq -1", "as the run began, with evaluations: --eval-freq -1 does not"),
+        ("-params planner_gradient_steps:11", "gradient_steps was 10"),
+        ("-n 160 -params n_envs:3", "goes on with n_envs=1, as the replay has them, got 3"),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            train.main(["--resume", str(copy), *words.split()])
+        assert message in f"{stop.value} {capsys.readouterr().err}"
+        assert json.loads((copy / "run.json").read_text()) == before
+        train.main(["--resume", str(copy)])
+        assert "nothing is left to do" in capsys.readouterr().out
+        assert same_agents(finished, copy)
+    train.main(["--resume", str(copy), "-n", "160"])
+    assert SAID.load(copy / f"{ENV}.zip").num_timesteps == 160 and (copy / ENDED_NAME).is_file()
     assert len([*copy.glob("*.monitor.csv")]) == 1
 
 
@@ -336,7 +319,7 @@ def test_episodes_after_the_checkpoint_are_not_counted_twice(tmp_path: Path) -> 
 def test_flags_of_rl_zoo3_work_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = "--algo sadr --env Pendulum-v1 --delay 1 --preset smoke -n 120 --save-replay-buffer --seed 3"
     agent = "Pendulum-v1"
-    board, params = tmp_path / "board", ["-params", "learning_starts:60"]
+    board, params = tmp_path / "board", ["-params", "learning_starts:100", NETWORKS]
     train_here(tmp_path, f"{command} --vec-env subproc -P --save-freq 50", "-tb", board, *params)
     assert "120/120" in "".join(capsys.readouterr())  # -P
     first, second = (tmp_path / "sadr" / f"Pendulum-v1-delay1-seed3_{k}" for k in (1, 2))
@@ -351,11 +334,12 @@ def test_flags_of_rl_zoo3_work_together(tmp_path: Path, capsys: pytest.CaptureFi
     assert model.replay_buffer is not None and model.replay_buffer.size() == 240
 
 
-def test_optimize_searches_and_writes_its_trials(tmp_path: Path) -> None:
+def test_optimize_searches_and_writes_its_trials_and_no_folder_of_a_run(tmp_path: Path) -> None:
     command = "--algo sadr --env Pendulum-v1 --delay 1 --preset smoke -n 20 --seed 3 --eval-episodes 1"
-    train_here(tmp_path, command, *"-optimize --n-trials 1 --n-evaluations 1 --no-optim-plots".split())
+    train_here(tmp_path, command, *"-optimize --n-trials 1 --n-startup-trials 0 --n-evaluations 1".split())
     (table,) = (tmp_path / "sadr").glob("report_*.csv")
     assert "params_learning_rate" in table.read_text().splitlines()[0]
+    assert not [*tmp_path.rglob("*_1")]
 
 
 def test_the_delay_range_and_its_flags_reach_the_run(tmp_path: Path) -> None:
@@ -383,7 +367,7 @@ def test_the_log_path_of_many_logs_is_one_that_a_disk_takes() -> None:
 
 
 def test_the_expert_can_learn_under_another_delay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    command = "--algo said --env Pendulum-v1 --delay 0 3 --expert-delay 0 --preset smoke -n 520 --seed 3"
+    command = "--algo said --env Pendulum-v1 --delay 0 3 --expert-delay 0 --preset smoke -n 220 --seed 3"
     ages: list[int] = []
 
     def told(model: SAID, like: EvalCallback, *_: Any) -> None:
@@ -392,8 +376,8 @@ def test_the_expert_can_learn_under_another_delay(tmp_path: Path, monkeypatch: p
 
     monkeypatch.setattr(manager, "evaluate_answer", told)
     monkeypatch.setattr("sb3_said.said.learning.let_the_best_answer", None)  # the expert's delay would tell of another
-    params = ["-params", "planner_gradient_steps:5", TINY_PLANNER, NETWORKS]
-    train_here(tmp_path, command, "--eval-freq", "400", *params)
+    params = ["-params", "learning_starts:200", "planner_gradient_steps:5", TINY_PLANNER, NETWORKS]
+    train_here(tmp_path, command, "--eval-freq", "200", *params)
     assert ages == [0, 1, 2, 3]
     played = load_run(tmp_path / "said" / "Pendulum-v1-delay0-3-expert0-seed3_1", device="cpu")
     assert played.info["delay"] == "EpisodeDelay(low=0, high=3)"
@@ -509,16 +493,10 @@ def test_numbers_are_read_as_they_are_written(tmp_path: Path) -> None:
     assert isinstance(model.batch_size, int)
 
 
-def test_a_search_of_rl_zoo3_leaves_no_folder_of_a_run(tmp_path: Path) -> None:
-    search = "-optimize --n-trials 1 --n-startup-trials 0 --n-evaluations 1 --n-eval-envs 1 -params buffer_size:100"
-    train_here(tmp_path, f"--algo sadr --env Pendulum-v1 --seed 1 -n 20 {search}")
-    assert not [*tmp_path.rglob("*_1")]
-
-
 def test_a_resume_of_fewer_steps_than_there_are_is_refused(finished: Path) -> None:
     record = (finished / "run.json").read_bytes()
-    with pytest.raises(SystemExit, match="has taken 200 steps: give -n more than that, or leave it out, got 150"):
-        train.main(["--resume", str(finished), "-n", "150"])
+    with pytest.raises(SystemExit, match="has taken 120 steps: give -n more than that, or leave it out, got 90"):
+        train.main(["--resume", str(finished), "-n", "90"])
     assert (finished / "run.json").read_bytes() == record and (finished / "ended.json").is_file()
     with pytest.raises(SystemExit, match="2"):
         train.main(["--resume", str(finished), "-optimize"])
@@ -527,15 +505,7 @@ def test_a_resume_of_fewer_steps_than_there_are_is_refused(finished: Path) -> No
 def test_a_resume_takes_no_option_of_the_start(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for words in (
-        "-conf own.yml",
-        "-f elsewhere",
-        "--storage x.log",
-        "--study-name s",
-        "--trial-id 3",
-        "-i a.zip",
-        "-uuid",
-    ):
+    for words in "-conf a.yml", "-f x", "--storage x.log", "--study-name s", "--trial-id 3", "-i a.zip", "-uuid":
         with pytest.raises(SystemExit):
             train.main(["--resume", str(finished), *words.split()])
         assert "goes on with the run's own --" in capsys.readouterr().err
@@ -553,7 +523,7 @@ def test_a_nan_of_the_task_is_in_no_checkpoint(
     import mine
 
     monkeypatch.setattr(mine.Mine, "steps", 0)
-    command = "--algo sadr --env Mine-v0 --gym-packages mine --delay 1 --seed 3 --checkpoint-freq 20 -n 150"
+    command = "--algo sadr --env Mine-v0 --gym-packages mine --delay 1 --seed 3 --checkpoint-freq 20 -n 100"
     task = ["--env-kwargs", "nan_at:90", f"nan_in:{nan_in!r}"]
     settings = ["-params", "learning_starts:30", "buffer_size:200", NETWORKS, *params]
     with np.errstate(all="ignore"), pytest.raises(ValueError):
@@ -562,7 +532,7 @@ def test_a_nan_of_the_task_is_in_no_checkpoint(
     assert f"by an error; --resume {run} goes on from the last checkpoint" in capsys.readouterr().out
     assert load_tree(run / "checkpoint.zip")["counters"]["num_timesteps"] == 80
     train.main(["--resume", str(run)])
-    assert DelayedSAC.load(run / "Mine-v0.zip").num_timesteps == 150
+    assert DelayedSAC.load(run / "Mine-v0.zip").num_timesteps == 100
 
 
 def test_a_full_disk_at_the_planners_checkpoint_loses_no_planner(

@@ -14,7 +14,7 @@ import pytest
 
 pytest.importorskip("rl_zoo3")
 
-from trained_run import ENV, PLANNER, train_here
+from trained_run import ENV, PLANNER, report_quickly, train_here
 
 from sb3_said import SAID
 from sb3_said.files.archive import load_tree
@@ -30,8 +30,8 @@ from sb3_said.zoo.runs import answers, load_run
 EVERY = "--eval-freq 10 --eval-episodes 2 --log-interval 10".split()
 PARAMS = {
     "bc": ["-params", "batch_size:16", "policy_kwargs:dict(net_arch=[16])"],
-    "dql": ["-params", "batch_size:16"],
-    "said": ["-params", f"planner_kwargs:{PLANNER}", "iql_kwargs:dict(expectile=0.9)"],
+    "dql": ["-params", "batch_size:16", "diffusion_kwargs:dict(hidden=16)"],
+    "said": ["-params", f"planner_kwargs:{PLANNER}", "iql_kwargs:dict(expectile=0.9, hidden=16, batch_size=16)"],
 }
 
 
@@ -92,7 +92,7 @@ def test_a_run_leaves_its_agent_record_log_and_evaluations(finished: tuple[str, 
     assert answers(load_run(run / "best_model.zip", device="cpu").model) == answers(model)
     assert not list(run.glob("*monitor.csv")) and not (run / "expert").exists()
     if isinstance(model, SAID):
-        assert model.policy.values is not None and model.policy.values.config == IQLConfig(expectile=0.9)
+        assert model.policy.values is not None and model.policy.values.config == IQLConfig(0.9, 16, batch_size=16)
     column = "train/action_error" if algo == "bc" else "iql/v_loss"
     assert column in (run / "progress.csv").read_text()
 
@@ -244,6 +244,7 @@ def test_tune_trains_depths_on_the_same_logs(
             tune.main([str(run)])
         assert "is a run of 'bc', which has no planner" in capsys.readouterr().err
         return
+    report_quickly(monkeypatch)
     monkeypatch.setattr(IQL, "step", lambda _: pytest.fail("V is the run's"))
     quick = "--depths 2 --temperatures 0.5 --sampling-steps 1 --episodes 2 --round 2 --report-episodes 2".split()
     for _ in range(2):  # the same command goes on after a crash, and where all is done

@@ -19,7 +19,7 @@ pytest.importorskip("scipy")
 from forked import begin, run_script
 from rl_zoo3 import exp_manager
 from stable_baselines3.common.torch_layers import FlattenExtractor
-from trained_run import ENV, config_of, read_by_train, train_run, train_said
+from trained_run import ENV, config_of, read_by_train, report_quickly, train_run, train_said
 
 from sb3_said import SAID, PlannerConfig
 from sb3_said.files.archive import load_tree
@@ -31,6 +31,7 @@ from sb3_said.zoo.arguments import read_delay
 from sb3_said.zoo.best import plain_settings, write_best
 from sb3_said.zoo.record import Record
 from sb3_said.zoo.runs import LoadedRun, load_run
+from sb3_said.zoo.search import save_plot
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "tune.py"
 QUICK = ["--episodes", "4", "--round", "2", "--report-episodes", "3", "--device", "cpu", "--num-threads", "1"]
@@ -45,6 +46,11 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run(trained: Path, tmp_path: Path) -> Path:
     """A run of its own, since tuning writes into it."""
     return Path(shutil.copytree(trained, tmp_path / "run"))
+
+
+@pytest.fixture(autouse=True)
+def quick_reports(monkeypatch: pytest.MonkeyPatch) -> None:
+    report_quickly(monkeypatch)
 
 
 def results_of(run: Path) -> dict[str, Any]:
@@ -89,7 +95,9 @@ def test_a_search_from_grid_to_report(
         return original(self, n, seed, *args, **kwargs)
 
     monkeypatch.setattr(LoadedRun, "play", recorded)
-    tune.main(command)
+    with monkeypatch.context() as patch:
+        patch.setattr(tune, "save_plot", save_plot)
+        tune.main(command)
     # Once for two temperatures, and never the depth that the run itself has.
     out = capsys.readouterr().out
     assert out.count("Training the planner of depth") == out.count("Training the planner of depth 2:") == 1
@@ -134,7 +142,7 @@ def test_a_search_from_grid_to_report(
     # A training reads the winner.
     best = run / "tune" / "best.yml"
     assert f"sb3-said train --algo said --env {ENV} --delay 2 -conf {best}" in out
-    expected = {**config_of(run), "n_timesteps": 200}
+    expected = {**config_of(run), "n_timesteps": 120}
     expected["planner_kwargs"] |= settings_of(run / "tune" / "best.zip")
     assert read_by_train(best, 2, run) == expected
     assert expected["planner_kwargs"]["choice_factor"] == 3.0  # as the run decides, and so each trial
@@ -166,7 +174,7 @@ def test_a_search_with_a_drawn_delay_or_vec_normalize(
     # What is reported is what best.zip and its statistics give again, and best.yml is of the same task.
     assert (load_run(run / "tune" / "best.zip", device="cpu").normalize is not None) == bool(params)
     check_report(run)
-    expected = {**config_of(run), "n_timesteps": 200}
+    expected = {**config_of(run), "n_timesteps": 120}
     expected["planner_kwargs"] |= settings_of(run / "tune" / "best.zip")
     assert read_by_train(run / "tune" / "best.yml", read_delay([str(d) for d in delay]), tmp_path) == expected
     assert f"--delay {' '.join(map(str, delay))} -conf" in capsys.readouterr().out
@@ -175,19 +183,13 @@ def test_a_search_with_a_drawn_delay_or_vec_normalize(
 def test_a_search_for_how_the_critics_choose(run: Path) -> None:
     grid = ["--depths", "1", "--temperatures", "0.5", "1", "--choice-factors", "0.5", "100", "--prune", "0"]
     tune.main([str(run), *grid, *QUICK])
-    trials, winner = results_of(run)["trials"], results_of(run)["winner"]
-    assert sorted((t["temperature"], t["choice_factor"]) for t in trials) == [
-        (0.5, 0.5),
-        (0.5, 100),
-        (1, 0.5),
-        (1, 100),
-    ]
+    tried, winner = results_of(run)["trials"], results_of(run)["winner"]
+    assert sorted((t["temperature"], t["choice_factor"]) for t in tried) == [(0.5, 0.5), (0.5, 100), (1, 0.5), (1, 100)]
     check_report(run)
     best: Any = load_run(run / "tune" / "best.zip", device="cpu").model
     assert best.policy.planner.config.choice_factor == winner["choice_factor"]
-    assert (
-        read_by_train(run / "tune" / "best.yml", 2, run)["planner_kwargs"]["choice_factor"] == winner["choice_factor"]
-    )
+    read = read_by_train(run / "tune" / "best.yml", 2, run)
+    assert read["planner_kwargs"]["choice_factor"] == winner["choice_factor"]
 
 
 def test_what_is_trained_with_its_yaml_is_what_won(run: Path, tmp_path: Path) -> None:

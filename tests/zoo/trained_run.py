@@ -7,13 +7,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import pytest
 import yaml
+from small_run import ENV
 
-from sb3_said.zoo import train
+from sb3_said import SAID
+from sb3_said.zoo import evaluate, train, tune
 from sb3_said.zoo.arguments import Delay
 from sb3_said.zoo.manager import DelayedExperimentManager, Run
 
-ENV = "InvertedPendulum-v5"
 NETWORKS = "policy_kwargs:dict(net_arch=[16])"
 PLANNER = "dict(depth=1, d_model=32, horizon=4, sampling_steps=1, n_candidates=2, batch_size=8)"
 
@@ -27,8 +29,8 @@ def train_here(folder: Path, command: str, *more: str | Path) -> None:
 def train_run(folder: Path, algo: str, *params: str, delay: Sequence[int] = (2,), options: Sequence[str] = ()) -> Path:
     train.main(
         ["--algo", algo, "--env", ENV, "--delay", *map(str, delay), "-f", str(folder), "--seed", "3",
-         "--num-threads", "1", "--eval-freq", "-1", "--device", "cpu", "--verbose", "0", "-n", "200", *options,
-         "-params", "learning_starts:100", "buffer_size:400", NETWORKS, *params]
+         "--num-threads", "1", "--eval-freq", "-1", "--device", "cpu", "--verbose", "0", "-n", "120", *options,
+         "-params", "learning_starts:80", "buffer_size:400", NETWORKS, *params]
     )  # fmt: skip
     return next((folder / algo).iterdir())
 
@@ -36,6 +38,12 @@ def train_run(folder: Path, algo: str, *params: str, delay: Sequence[int] = (2,)
 def train_said(folder: Path, *params: str, delay: Sequence[int] = (2,)) -> Path:
     planner = ("planner_gradient_steps:3", "planner_trial_episodes:1", f"planner_kwargs:{PLANNER}")
     return train_run(folder, "said", *planner, *params, delay=delay)
+
+
+def report_quickly(patch: pytest.MonkeyPatch) -> None:
+    """Let a search's report time few decisions and draw no plot."""
+    patch.setattr(tune, "evaluate", lambda *how, latency_calls: evaluate.evaluate(*how, latency_calls=2))
+    patch.setattr(tune, "save_plot", lambda *_: None)
 
 
 def read_by_train(best: Path, delay: Delay, folder: Path) -> dict[str, Any]:
@@ -46,5 +54,11 @@ def read_by_train(best: Path, delay: Delay, folder: Path) -> dict[str, Any]:
 
 
 def config_of(run: Path) -> dict[str, Any]:
-    """Return the hyper-parameters that a run was trained with."""
-    return dict(yaml.load((run / ENV / "config.yml").read_text(), Loader=yaml.UnsafeLoader))
+    """Return the hyper-parameters that a run was last trained with."""
+    (file,) = run.glob("*/config.yml")
+    return dict(yaml.load(file.read_text(), Loader=yaml.UnsafeLoader))
+
+
+def same_agents(left: Path, right: Path) -> bool:
+    one, other = (SAID.load(run / f"{ENV}.zip", device="cpu").policy.state_dict() for run in (left, right))
+    return all((one[key] == other[key]).all() for key in one)
