@@ -137,7 +137,7 @@ def test_values_are_in_the_units_of_rewards(task, reward):
     if task == "delayed":
         env = delayed(2)
         env.env = with_rewards(reward)
-    model = make(env, cls=SAID, **QUICK).learn(150)
+    model = make(env, cls=SAID, **QUICK).learn(190)
     batch = model.replay_buffer.sample(200)
     states = batch.observations[UNDELAYED] if task == "delayed" else batch.observations
     with th.no_grad():
