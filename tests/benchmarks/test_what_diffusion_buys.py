@@ -43,7 +43,8 @@ def run(tmp_path_factory):
 @pytest.fixture(scope="module")
 def ended(tmp_path_factory):
     """Return a run of another seed that has ended."""
-    return write_run(tmp_path_factory.mktemp("runs") / "ended", SAID, (0, 2), 90, 1, True, learning_starts=80)
+    folder = tmp_path_factory.mktemp("runs") / "ended"
+    return write_run(folder, SAID, (0, 2), 90, seed=1, checkpoint=True, learning_starts=80)
 
 
 def test_rows_are_played_by_whom_they_name(run, tmp_path, monkeypatch, capsys):

@@ -37,9 +37,9 @@ def train(data, updates, gamma=0.9, **config):
     return values
 
 
-def test_a_bandit_has_the_expectile_of_its_arms_as_value():
+@pytest.mark.parametrize("tau", [0.5, 0.9])
+def test_a_bandit_has_the_expectile_of_its_arms_as_value(tau):
     """Arms of 0 and 4, drawn alike: tau (4 - v) = (1 - tau) v, so V is 4 tau; Q is each arm's reward."""
-    tau = 0.9
     actions, end = np.array([[-1.0], [1.0]]), [True, True]
     rewards = np.array([0.0, 4.0])
     values = train(dataset(np.zeros((2, 2)), actions, rewards, end, end, np.zeros((2, 2))), 300, expectile=tau)

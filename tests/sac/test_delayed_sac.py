@@ -97,11 +97,11 @@ def test_without_delay_it_learns_as_sb3s_sac(make_env, kwargs):
     for cls in (SAC, DelayedSAC):
         model = make(make_env(), cls=cls, **kwargs)
         model.set_logger(Logger(None, []))
-        model.learn(70, log_interval=None)
+        model.learn(130, log_interval=None)
         runs.append((model, dict(model.logger.name_to_value)))
     (sac, expected), (ours, losses) = runs
     assert {"train/actor_loss", "train/critic_loss"} <= losses.keys()
-    assert losses["train/n_updates"] > 20
+    assert losses["train/n_updates"] > 50
     assert losses == expected
     assert_same_parameters(ours, sac)
 

@@ -96,10 +96,8 @@ HARMLESS = {
 @pytest.mark.parametrize("make_task", [Faulty, wrapped])
 @pytest.mark.parametrize("fault", HARMLESS)
 def test_what_can_be_understood_is_learned_from_as_if_it_kept_the_rules(fault, make_task, truncates):
-    model, expected = (
-        learn(make_task(HARMLESS[fault], truncates=truncates)),
-        learned_of_a_whole_one(make_task, truncates),
-    )
+    model = learn(make_task(HARMLESS[fault], truncates=truncates))
+    expected = learned_of_a_whole_one(make_task, truncates)
     assert same_replay(model, expected)
     for name in ("dones", "timeouts"):
         np.testing.assert_array_equal(getattr(model.replay_buffer, name), getattr(expected.replay_buffer, name))

@@ -345,7 +345,8 @@ def test_enjoy_says_what_is_wrong(
     assert exit_info.value.code == 2 and message in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("fps", "own"), [(12, 25), (25, 25), (60, 25), (30, 125), (60, 125), (125, 125), (12, None)])
+@pytest.mark.parametrize("own", [25, 125, None])
+@pytest.mark.parametrize("fps", [10, 12, 25, 30, 60, 125])
 @pytest.mark.parametrize("suffix", [".gif", ".mp4"])
 def test_video_plays_in_real_time(fps: int, own: int | None, suffix: str, tmp_path: Path) -> None:
     imageio = pytest.importorskip("imageio.v3")

@@ -83,18 +83,19 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run_of(folder)
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP], ids=lambda n: n.name)
 def test_a_signal_to_the_experts_training(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    before = signal.getsignal(signal.SIGINT)
+    before = signal.getsignal(number)
     with monkeypatch.context() as patch:
-        signal_at(patch, StableSAC, "train", 30, signal.SIGINT)  # of updates, the first after step 50
+        signal_at(patch, StableSAC, "train", 30, number)  # of updates, the first after step 50
         with pytest.raises(SystemExit) as stop:
             train.main(arguments(tmp_path))
     run = run_of(tmp_path)
-    assert stop.value.code == 130 and signal.getsignal(signal.SIGINT) is before
+    assert stop.value.code == 130 and signal.getsignal(number) is before
     shown = capsys.readouterr().out
-    assert "SIGINT: the training stops after this step" in shown
+    assert f"{number.name}: the training stops after this step" in shown
     assert f"Interrupted at step 80 and wrote a checkpoint; go on with --resume {run}" in shown
     counters = load_tree(run / "checkpoint.zip")["counters"]
     assert (counters["num_timesteps"], counters["_n_updates"]) == (80, 30)  # no update is lost
@@ -134,13 +135,13 @@ def test_a_signal_to_the_planners_training_loses_no_update(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with monkeypatch.context() as patch:
-        signal_at(patch, PlannerTrainer, "step", 7, signal.SIGHUP)
+        signal_at(patch, PlannerTrainer, "step", 7, signal.SIGTERM)
         with pytest.raises(SystemExit) as stop:
             train.main(arguments(tmp_path))
     run = run_of(tmp_path)
-    assert stop.value.code == 130 and signal.getsignal(signal.SIGHUP) is signal.SIG_DFL
+    assert stop.value.code == 130 and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     shown = capsys.readouterr().out
-    assert "SIGHUP: the training stops after this step" in shown and f"go on with --resume {run}" in shown
+    assert "SIGTERM: the training stops after this step" in shown and f"go on with --resume {run}" in shown
     assert load_tree(run / "planner_checkpoint.zip")["trainer"]["n_updates"] == 7
     assert not same_agents(run, whole)
     with pytest.warns(UserWarning, match="after 100 steps, before its planner was trained to the end, and tried: it"):

@@ -92,7 +92,8 @@ def test_a_run_leaves_its_agent_record_log_and_evaluations(finished: tuple[str, 
     assert answers(load_run(run / "best_model.zip", device="cpu").model) == answers(model)
     assert not list(run.glob("*monitor.csv")) and not (run / "expert").exists()
     if isinstance(model, SAID):
-        assert model.policy.values is not None and model.policy.values.config == IQLConfig(0.9, 16, batch_size=16)
+        assert model.policy.values is not None
+        assert model.policy.values.config == IQLConfig(expectile=0.9, hidden=16, batch_size=16)
     column = "train/action_error" if algo == "bc" else "iql/v_loss"
     assert column in (run / "progress.csv").read_text()
 
