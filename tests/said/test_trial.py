@@ -322,6 +322,13 @@ def test_episodes_may_end_above_their_monitor(task):
         assert all(0 < r <= 9 for returns in found.returns.values() for r in returns)
 
 
+def test_the_tasks_own_rewards_count_where_a_wrapper_above_its_monitor_changes_them():
+    task = Monitor(gym.wrappers.TransformReward(gym.make("Pendulum-v1", max_episode_steps=9), lambda _: 1.0))
+    env = DelayedObservationWrapper(gym.wrappers.TransformReward(task, lambda reward: reward / 100), 2)
+    found = trial.play_trial(make(env=env, planner_ways={}).learn(25), n_episodes=2)
+    assert {name: returns.tolist() for name, returns in found.returns.items()} == {"planner": [9, 9], "expert": [9, 9]}
+
+
 def test_a_monitor_that_allows_no_early_reset_is_none_in_a_trial():
     env = Monitor(pendulum(), allow_early_resets=False)
     model = make(env=env, planner_trial_episodes=1).learn(25)
