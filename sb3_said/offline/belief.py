@@ -182,7 +182,7 @@ class BeliefOnly:
     :param actor: anything with SB3's ``predict`` and ``observation_space``: an agent of a task without delay, or one of
         ours under delay, which is shown the believed state at age 0
     :param device: of the belief
-    :raises ValueError: for an actor of other observations, or one that learned with ``VecNormalize``
+    :raises ValueError: for an actor of other observations, or one of ours that learned with ``VecNormalize``
     """
 
     def __init__(self, belief: Belief, actor: Any, device: th.device | str = "cpu"):

@@ -110,7 +110,7 @@ def fit_first_guess(
     :param config: of the planner: how windows are drawn and weighed
     :param n_updates: on single steps
     :param generator: of the batches
-    :param longest: steps that the model will be rolled out over; at 1 there is no second part
+    :param longest: steps that the model will be rolled out over; at 1 there is no second part, at 0 no model to train
     :param progress_bar: show one
     :param should_stop: asked after every update
     :param older: older steps, for half of each of the model's batches and none of the clone's: what a policy did goes
@@ -136,13 +136,14 @@ def fit_first_guess(
         windows = draw(2)
         state = normalizer.normalize_states(windows.states[:, 0])
         weight = window_weight(windows.values, config.weight_factor)
-        return guess.clone_loss(state, windows.actions[:, 0], weight) + model_loss(windows)
+        loss = guess.clone_loss(state, windows.actions[:, 0], weight)
+        return loss + model_loss(windows) if longest > 0 else loss
 
     rate, asked = OneStepModel.learning_rate, (progress_bar, should_stop)
-    rates = {model: rate, clone: CLONE_LEARNING_RATE}
+    rates: dict[nn.Module, float] = ({model: rate} if longest > 0 else {}) | {clone: CLONE_LEARNING_RATE}
     if not descend(both_losses, rates, None, n_updates, "first guess", *asked):
         return False
-    if longest == 1:
+    if longest <= 1:
         return True
     rates, n_updates = {model: ROLLED_RATE * rate}, -(-n_updates // ROLLED_EACH)
     return descend(lambda: model_loss(draw(longest + 1)), rates, ROLLED_CLIP, n_updates, f"{longest} steps", *asked)

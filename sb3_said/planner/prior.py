@@ -36,7 +36,7 @@ class Prior(nn.Module):
 
     @property
     def is_fitted(self) -> bool:
-        """Whether :meth:`fit` has been called."""
+        """Whether :meth:`fit` has learned anything; it does not from fewer windows than ``FEWEST_WINDOWS``."""
         return bool((self.std != 1).any())
 
     @th.no_grad()

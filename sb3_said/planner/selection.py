@@ -63,6 +63,8 @@ def choose(actions: th.Tensor, values: th.Tensor, factor: float | None) -> th.Te
     n = is_allowed.sum(1, keepdim=True)
     mean = th.where(is_allowed, values, 0.0).sum(1, keepdim=True) / n
     off = th.where(is_allowed, values - mean, 0.0)
-    z = off / (off.square().sum(1, keepdim=True) / n).sqrt().clamp(min=1e-6)
+    rounding = 1e-6 * th.where(is_allowed, values, 0.0).abs().amax(1, keepdim=True)  # alike values have z = 0
+    deviation = (off.square().sum(1, keepdim=True) / n).sqrt()
+    z = th.where(deviation > rounding, off / deviation, 0.0)
     weights = th.where(is_allowed, factor * z, -th.inf).softmax(1)
     return (weights[..., None] * actions).sum(1)

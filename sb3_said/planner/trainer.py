@@ -209,7 +209,7 @@ class PlannerTrainer:
             self.config,
             n_updates,
             self.generator,
-            self.guess_steps,
+            min(self.guess_steps, self.average.max_delay),
             progress_bar=progress_bar,
             should_stop=should_stop,
             older=None if older is None else older.to(self.device),
@@ -304,10 +304,10 @@ class PlannerTrainer:
 
     @th.no_grad()
     def evaluate(self) -> dict[str, float]:
-        """Return mean absolute errors on held-out windows, for every delay d from 0 to D.
+        """Return mean absolute errors on held-out windows, for every delay d that is trained and that some show.
 
         ``planner/present_error_d4`` is the error of the decoded s_t at delay 4, in standard deviations of the states;
-        ``planner/action_error_d4`` that of the decision a_t, in environment units; ``..._mlp_d4`` are the
+        ``planner/action_error_d4`` that of the decision a_t, in [-1, 1]; ``..._mlp_d4`` are the
         regression's. The planner decodes with its averaged weights, one candidate and temperature 0.
         """
         self._check_finite()

@@ -27,10 +27,10 @@ class RegressionYardstick(nn.Module):
         self.net = plain_network(obs_dim + max_delay * (act_dim + 1), obs_dim + act_dim, hidden)
 
     def forward(self, state: th.Tensor, actions: th.Tensor, delay: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Predict the present (B, obs_dim), normalised, and the decision (B, act_dim), in environment units.
+        """Predict the present (B, obs_dim), normalised, and the decision (B, act_dim), in [-1, 1].
 
         :param state: (B, obs_dim) s_{t-d}, normalised
-        :param actions: (B, >= D, act_dim) the window's actions in environment units; those from index d on are not read
+        :param actions: (B, >= D, act_dim) the window's actions, in [-1, 1]; those from index d on are not read
         :param delay: (B,) int64, d
         """
         known = th.arange(self.max_delay, device=delay.device) < delay[:, None]  # (B, D)

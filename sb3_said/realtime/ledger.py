@@ -112,7 +112,8 @@ class Ledger:
         :param latest: latest possible time of a capture; NaN if unknown
         :raises ValueError: for what is no state, or for more actions than were sent
         """
-        state = np.array(observation, np.float32)
+        with np.errstate(over="ignore"):  # refused with a reason next
+            state = np.array(observation, np.float32)
         if state.shape != self.state_space.shape or not np.isfinite(state).all():
             raise ValueError(
                 f"The observation has the shape {state.shape} and entries {state}, expected finite numbers of the "

@@ -44,9 +44,11 @@ def mean_and_deviation(rows: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
 
     Rounding may leave a constant entry a tiny deviation. To divide by it would blow up noise.
     """
-    variance, mean = th.var_mean(rows, dim=0, correction=0)  # rows.mean would round where an entry never moves
-    deviation = variance.sqrt()
-    return mean, th.where(deviation <= 1e-6 * rows.abs().amax(0), 1.0, deviation)
+    size = rows.abs().amax(0)
+    unit = th.exp2(size.clamp(min=1e-38).log2().floor())  # rounds nothing, and squares stay in float32
+    variance, mean = th.var_mean(rows / unit, dim=0, correction=0)  # rows.mean would round where an entry never moves
+    deviation = variance.sqrt() * unit
+    return mean * unit, th.where(deviation <= 1e-6 * size, 1.0, deviation)
 
 
 @dataclass(frozen=True)

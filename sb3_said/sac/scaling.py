@@ -34,7 +34,7 @@ class ReturnScale(OnTheHost):
     """The size of discounted returns so far, to divide rewards by (SimbaV2, https://arxiv.org/abs/2502.15280).
 
     It keeps mean, variance and largest size of the running returns G_t = gamma G_{t-1} + r_t of all steps, with
-    G_{t-1} = 0 where an episode begins. ``value`` = max(sd(G), max |G| / 5), and 1 before the first step.
+    G_{t-1} = 0 where an episode begins. ``value`` = max(sd(G), max |G| / 5), and 1 as long as all rewards are 0.
     """
 
     mean: th.Tensor
@@ -45,8 +45,8 @@ class ReturnScale(OnTheHost):
 
     def __init__(self) -> None:
         super().__init__()
-        for name, start in (("mean", 0.0), ("variance", 1.0), ("count", 1e-4), ("largest", 0.0)):
-            self.register_buffer(name, th.tensor(start, dtype=th.float64))
+        for name in ("mean", "variance", "count", "largest"):
+            self.register_buffer(name, th.zeros((), dtype=th.float64))
         self.register_buffer("value", th.ones(()), persistent=False)
         self.register_load_state_dict_post_hook(_take_value)
 

@@ -33,5 +33,5 @@ class PlannerAgent(OfflineAlgorithm):
 
     @property
     def planner_is_current(self) -> bool:
-        """Whether :meth:`train_planner`, with its trial, has ended since the last step. After logs always False."""
+        """Whether :meth:`train_planner`, with its trial, has ended since the last step."""
         return self.policy.planner_is_trained and self._planner_trained_at == self.num_timesteps

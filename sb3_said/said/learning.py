@@ -24,7 +24,7 @@ from sb3_said.planner.values import returns_to_go
 from sb3_said.said.agent import PlannerAgent
 from sb3_said.said.training import PlannerTraining
 from sb3_said.said.trial import MakeEnv, let_the_best_answer, stopped_alone
-from sb3_said.said.ways import in_way, masks_of, untried, ways_of
+from sb3_said.said.ways import other_planners, untried, ways_of
 
 HELD_OUT = 0.05  # of the planner's data
 HAND_OVER_INTERVAL = 100  # updates of an offline training
@@ -68,7 +68,7 @@ class PlannerLearner(PlannerAgent):
         folder: str | Path | None = None,
         progress_bar: bool = False,
         log_interval: int | None = 500,
-        eval_interval: int = 2_000,
+        eval_interval: int | None = 2_000,
         save_interval: int | None = None,
         trial_episodes: int | None = None,
         should_stop: Callable[[], bool] | None = None,
@@ -91,7 +91,7 @@ class PlannerLearner(PlannerAgent):
         :param progress_bar: show one
         :param log_interval: updates between two rows of losses in the log; None for one, at the end
         :param eval_interval: updates between two measurements of the held-out errors, the planner's and the
-            regression's; they are measured only where ``log_interval`` has a row, too
+            regression's; they are measured only where ``log_interval`` has a row, too. None for one, at the end
         :param save_interval: updates between two checkpoints; by default ten minutes, and longer where they are large
         :param trial_episodes: ``planner_trial_episodes`` by default; none are played where there is no environment, or
             no expert to compare with
@@ -123,9 +123,8 @@ class PlannerLearner(PlannerAgent):
             self._logger = configure_logger(self.verbose, self.tensorboard_log, "SAID", reset_num_timesteps=False)
 
         is_tried = n_episodes > 0 and self._can_be_tried()
-        planners, config = [self.policy.planner], self.policy.planner.config
-        for mask in masks_of(self)[1:] if is_tried else []:
-            planners.append(self.policy.new_planner(in_way(config, {"mask": mask})))
+        planners = [self.policy.planner]
+        planners += [self.policy.new_planner(config) for config in (other_planners(self) if is_tried else [])]
         for k, planner in enumerate(planners):
             trainer = self.make_planner_trainer(gradient_steps, planner)
             values = self._make_value_trainer() if k == 0 else None
@@ -162,7 +161,7 @@ class PlannerLearner(PlannerAgent):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
         folder: str | Path | None = None,
-        eval_interval: int = 2_000,
+        eval_interval: int | None = 2_000,
         save_interval: int | None = None,
         should_stop: Callable[[], bool] | None = None,
     ) -> SelfLearner:

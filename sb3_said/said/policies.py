@@ -175,10 +175,10 @@ class SAIDPolicy(DelayedSACPolicy):
         n_ages, part = self.max_delay + 1, float(who == "expert")
         if who == "both":
             n = 0  # how many ages the expert has, below 0 where they are the largest
-            if expert_up_to is not None and expert_from is None and 0 <= expert_up_to < self.max_delay:
-                n = expert_up_to + 1
-            elif expert_from is not None and expert_up_to is None and 0 < expert_from <= self.max_delay:
-                n = expert_from - n_ages
+            if expert_up_to is not None and expert_from is None and expert_up_to in range(self.max_delay):
+                n = int(expert_up_to) + 1
+            elif expert_from is not None and expert_up_to is None and expert_from in range(1, n_ages):
+                n = int(expert_from) - n_ages
             if self.max_delay == 0:
                 raise ValueError("Without delay there is no age but 0, at which one answers: 'planner' or 'expert'.")
             if n == 0:

@@ -60,7 +60,8 @@ class SAID(PlannerLearner, StableSAC):
     :param planner_ways: the ways to decide that are compared with ``planner_kwargs``, by name: settings of
         :meth:`set_planner`, or a ``mask``, for which a second planner is trained. By default
         :data:`~sb3_said.said.ways.WAYS`, or none where ``planner_kwargs`` has settings of ``set_planner``. A planner of
-        ``mask="own"`` is left out where not every age was trained on, and on logs
+        ``mask="own"`` is left out where not every age was trained on, and on logs. What a way does not name is as the
+        planner has it when the trial begins, ``mask`` and ``present`` as it had them first
     :param value: who scores the planner's candidates: ``"critics"``, the expert's, by min Q(s, a); or ``"iql"``, a
         V(s) that implicit Q-learning learns beside the planner, as offline learning always does
     :param iql_kwargs: fields of :class:`~sb3_said.offline.IQLConfig` for learning that V(s), such as

@@ -50,7 +50,7 @@ class PlannerTraining:
         row: Callable[[int], int],
         folder: str | Path | None,
         log_interval: int | None,
-        eval_interval: int,
+        eval_interval: int | None,
         save_interval: int | None,
         watcher: BaseCallback | None = None,
     ):
@@ -101,7 +101,8 @@ class PlannerTraining:
             is_end = done == total
             self._train_values()
             if is_end or (self.log_interval is not None and done % self.log_interval == 0):
-                bar.set_postfix(loss=self._log_row(done % self.eval_interval == 0 or is_end))
+                evaluates = is_end or (self.eval_interval is not None and done % self.eval_interval == 0)
+                bar.set_postfix(loss=self._log_row(evaluates))
             goes_on = on_step is None or on_step(done)  # before the checkpoint, which keeps what callbacks counted
             outcome = "stopped" if should_stop is not None and should_stop() else "done"
             clock = self._clock

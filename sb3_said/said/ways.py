@@ -109,8 +109,10 @@ def _configs(model: PlannerAgent) -> dict[str, PlannerConfig]:
     return {name: in_way(model.policy.planner.config, settings) for name, settings in model.planner_ways.items()}
 
 
-def masks_of(model: PlannerAgent) -> list[str]:
-    """Return the masks for which the agent's ways to decide need a planner, that of its own planner first.
+def other_planners(model: PlannerAgent) -> list[PlannerConfig]:
+    """Return the settings of the planners that the agent's ways to decide need beside its own, one for each mask.
+
+    Each has those of the first way of its mask, in which it is measured.
 
     Where not every age of 0..D was trained on, or ages are not known, as in logs, ``"own"`` is left out: without
     decisions at each age such a planner would serve some delays alone.
@@ -121,8 +123,8 @@ def masks_of(model: PlannerAgent) -> list[str]:
     without = set() if knows_ages else {"own"}
     if model.trained_ages != [max_delay]:
         without |= {"fixed"}  # which plans at the largest age alone
-    others = {config.mask for config in _configs(model).values()} - {own} - without
-    return [own, *sorted(others)]
+    firsts = {config.mask: config for config in reversed(_configs(model).values())}
+    return [firsts[mask] for mask in sorted(firsts.keys() - {own} - without)]
 
 
 def players_of(

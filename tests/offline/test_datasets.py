@@ -98,6 +98,16 @@ def test_with_next_observations_time_limits_need_not_be_told(rounded, log, tmp_p
     same(load(write(tmp_path / "log.npz", log)), replace(whole, finals=whole.finals + 1e-5 * rounded))
 
 
+@pytest.mark.parametrize(("unit", "offset"), [(1e-6, 0.0), (1e-4, 1.0), (1e6, 0.0), (0.1, 1000.0)])
+def test_episodes_are_told_apart_in_any_unit(unit, offset, log, tmp_path):
+    whole = load(write(tmp_path / "whole.npz", log))
+    del log["timeouts"]
+    for name in ("observations", "next_observations"):
+        log[name] = (unit * log[name] + offset).astype(np.float32)
+    found = load(write(tmp_path / "log.npz", log))
+    assert found.lengths.tolist() == whole.lengths.tolist() and len(whole.lengths) > 1
+
+
 def test_other_names_mean_the_same(log, tmp_path):
     renamed = dict(
         zip(("obs", "actions", "rewards", "terminations", "truncations", "next_obs"), log.values(), strict=True)

@@ -168,11 +168,13 @@ def test_older_steps_teach_the_model_and_not_the_clone():
     th.testing.assert_close(clones["both"], clones["newest alone"], atol=0.1, rtol=0)
 
 
-def make_trainer(gradient_steps: int = 12, n_episodes: int = 40, length: int = 20, **changes) -> PlannerTrainer:
+def make_trainer(
+    gradient_steps: int = 12, n_episodes: int = 40, length: int = 20, max_delay: int = D, **changes
+) -> PlannerTrainer:
     small = dict(depth=1, d_model=32, horizon=HORIZON, batch_size=16, warmup_steps=4)
     with th.random.fork_rng(devices=[]):
         th.manual_seed(0)
-        planner = InpaintingPlanner(STATE_DIM, ACTION_DIM, D, PlannerConfig(**{**small, **changes}))
+        planner = InpaintingPlanner(STATE_DIM, ACTION_DIM, max_delay, PlannerConfig(**{**small, **changes}))
     return PlannerTrainer(planner, make_source(n_episodes, length), gradient_steps, guess_steps=D)
 
 
@@ -233,6 +235,15 @@ def test_it_takes_no_more_updates_than_planner_and_data_are_worth(gradient_steps
     n_updates = next(n for n in range(len(asked)) if n + math.ceil(n / ROLLED_EACH) == len(asked))
     passes = 256 * n_updates / len(trainer.source)
     assert n_updates == 5 * gradient_steps or n_updates == most or 50 <= passes < 50.5
+
+
+def test_without_delay_it_has_no_model_to_train():
+    """What is observed is the present: the clone's answer is all that a window is guessed from."""
+    trainer = make_trainer(4, max_delay=0)
+    before = {name: x.clone() for name, x in trainer.online.first_guess.state_dict().items()}
+    trainer.make_first_guess()
+    changed = {name for name, x in trainer.online.first_guess.state_dict().items() if not th.equal(x, before[name])}
+    assert changed == {name for name in before if name.startswith("clone.")} | {"model.move_std"}
 
 
 def test_it_can_be_stopped():

@@ -117,6 +117,7 @@ def test_an_age_beyond_what_the_model_reads_is_counted_in_full(gaps, max_delay, 
     [
         ([1.0, 2.0], 0, None, r"shape \(2,\)"),
         ([math.nan], 0, None, "finite"),
+        ([1e300], 0, None, "finite"),
         ([1.0], math.nan, None, "capture_time is nan"),
         ([1.0], None, 1, "1 actions were executed, but 0 were sent"),
         ([1.0], None, -1, "-1 actions"),

@@ -17,7 +17,6 @@ from small_agent import observe
 from small_task import Drift, delayed, pendulum
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import VecNormalize
 from torch.nn import functional as F
@@ -53,14 +52,26 @@ def with_rewards(reward):
 
 @given(st.lists(arrays(np.float64, 3, elements=st.floats(-1e3, 1e3)), min_size=1, max_size=8))
 def test_the_scale_of_returns(batches):
-    scale, expected = ReturnScale(), RunningMeanStd(shape=())
+    scale = ReturnScale()
     for returns in batches:
         scale.update(returns)
-        expected.update(returns)
-    np.testing.assert_allclose([scale.mean, scale.variance, scale.count], [expected.mean, expected.var, expected.count])
-    largest = np.abs(batches).max()
-    np.testing.assert_allclose(scale.value, max(np.sqrt(expected.var), largest / 5))
-    assert largest / scale.value <= 5 * (1 + 1e-6)  # in float32
+    everything = np.concatenate(batches)
+    np.testing.assert_allclose(
+        [scale.mean, scale.variance, scale.count], [everything.mean(), everything.var(), everything.size], atol=1e-9
+    )
+    size = max(everything.std(), np.abs(everything).max() / 5)
+    np.testing.assert_allclose(scale.value, size if np.float32(size) > 0 else 1.0, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("unit", [2.0**-27, 2.0**27])
+def test_the_unit_of_rewards_does_not_matter(unit):
+    def learned(unit):
+        return make(env=with_rewards(unit), learning_starts=20).learn(60)
+
+    found, expected = learned(unit), learned(1.0)
+    assert float(found.policy.return_scale.value) == unit * float(expected.policy.return_scale.value)
+    weights = zip(found.policy.parameters(), expected.policy.parameters(), strict=True)
+    assert all(th.equal(weight, of_one) for weight, of_one in weights)
 
 
 def test_before_the_first_return_nothing_is_scaled():
@@ -78,7 +89,7 @@ def test_states_are_scored():
     assert normalizer(th.full((1, 3), 1e6)).max() == 10  # an entry that never moved, and then does
 
 
-@pytest.mark.parametrize("unit", [1e-7, 1e7])
+@pytest.mark.parametrize("unit", [1e-30, 1e-7, 1e7, 1e30])
 @pytest.mark.parametrize("scale", [StateNormalizer, ZScored])
 def test_the_unit_of_a_state_does_not_matter(scale, unit):
     def scores(states):

@@ -486,6 +486,15 @@ def test_unknown_intervals_are_refused_before_the_training():
             model.train_planner(**wrong)
 
 
+@pytest.mark.parametrize(("interval", "expected"), [(None, [6]), (4, [4, 6]), (2, [2, 4, 6])])
+def test_held_out_errors_are_measured_at_the_end_and_as_often_as_asked(interval, expected):
+    memory, model = Memory(), make()
+    model.set_logger(Logger(None, [memory]))
+    model.learn(15, PlannerTrainingCallback(log_interval=1, eval_interval=interval))
+    rows = [row for row in memory.rows if "planner/action_error_d0" in row or "planner/action_error_d2" in row]
+    assert [row["planner/n_updates"] for row in rows] == expected
+
+
 def test_an_agent_without_planner_is_refused_by_name():
     with pytest.raises(TypeError, match=r"PlannerTrainingCallback trains SAID's planner, got StableSAC: leave it out"):
         StableSAC("MlpPolicy", "Pendulum-v1", buffer_size=9, device="cpu").learn(2, PlannerTrainingCallback())

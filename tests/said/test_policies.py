@@ -567,8 +567,8 @@ def test_both_need_an_age_and_keep_what_each_has_met(saved, tmp_path):
     model = SAID.load(saved, device="cpu")
     max_delay = model.policy.max_delay
     wrong = [{}, {"expert_up_to": 0, "expert_from": 1}]
-    wrong += [{"expert_up_to": age} for age in (-2, -1, max_delay, max_delay + 2)]
-    wrong += [{"expert_from": age} for age in (-1, 0, max_delay + 1, max_delay + 2)]
+    wrong += [{"expert_up_to": age} for age in (-2, -1, 0.5, max_delay - 0.5, max_delay, max_delay + 2)]
+    wrong += [{"expert_from": age} for age in (-1, 0, 0.5, 1.5, max_delay + 1, max_delay + 2)]
     for ages in wrong:
         with pytest.raises(ValueError, match=r"expert_up_to is .* and expert_from .* expected one of them"):
             model.set_answer("both", **ages)

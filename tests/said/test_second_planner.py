@@ -116,6 +116,21 @@ def test_a_training_in_a_folder_is_gone_on_with_whichever_planner_the_agent_kept
     assert updates == [] and same(weights(model.policy.planner), second)
 
 
+def test_each_is_measured_as_it_would_decide(monkeypatch):
+    measured, evaluate = [], PlannerTrainer.evaluate
+
+    def told(trainer):
+        measured.append((trainer.average.config.mask, trainer.average.config.present))
+        return evaluate(trainer)
+
+    monkeypatch.setattr(PlannerTrainer, "evaluate", told)
+    rig(monkeypatch, "own_ages")
+    model = make_two(planner_trial_episodes=3).learn(25)
+    assert measured == [("random", "guessed"), ("own", "inpainted")]
+    model.train_planner()  # the second is the agent's own now
+    assert measured[2:] == [("own", "inpainted"), ("random", "guessed")]
+
+
 def test_both_begin_with_one_first_guess(monkeypatch):
     trained, fit = [], trainer_module.fit_first_guess
 

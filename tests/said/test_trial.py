@@ -18,7 +18,7 @@ from sb3_said.delays import UniformDelay
 from sb3_said.planner import trainer as trainer_module
 from sb3_said.planner.trainer import GUESS_UPDATES_EACH
 from sb3_said.said import trial
-from sb3_said.said.ways import WAYS, masks_of
+from sb3_said.said.ways import WAYS, other_planners
 
 OF_ONE_PLANNER = {name: way for name, way in WAYS.items() if name != "own_ages"}
 
@@ -460,8 +460,9 @@ def test_a_planner_of_one_age_is_not_tried_at_others_and_no_second_one_is_traine
         ).learn(25)
     assert model.policy.who_answers == "planner"
     ways = {"paper": {"mask": "fixed", "present": "inpainted"}}
-    assert masks_of(make(env=pendulum(delay=(0, 2)), planner_ways=ways).learn(25)) == ["random"]
-    assert masks_of(make(env=pendulum(), planner_ways=ways).learn(25)) == ["random", "fixed"]
+    assert other_planners(make(env=pendulum(delay=(0, 2)), planner_ways=ways).learn(25)) == []
+    (other,) = other_planners(make(env=pendulum(), planner_ways=ways).learn(25))
+    assert (other.mask, other.present) == ("fixed", "inpainted")
 
 
 def test_without_delay_no_way_is_played_twice():
