@@ -46,7 +46,7 @@ def panels(n: int = 1, title: str = "", width: float = 5.0, height: float = 3.6)
     columns = math.ceil(n / rows)
     figure = Figure(figsize=(columns * width, rows * height), dpi=150, layout="constrained")
     if title:
-        figure.suptitle(title)
+        figure.suptitle(textwrap.fill(title, int(10 * columns * width)))  # characters of this size on its width
     axes = [figure.add_subplot(rows, columns, i + 1) for i in range(n)]
     for ax in axes:
         ax.spines[["top", "right"]].set_visible(False)
@@ -138,7 +138,7 @@ def plot_returns(summaries: Sequence[Summary], ax: Axes | None = None) -> Axes:
     :param summaries: for instance the planner's and the expert's, in the order of the columns
     :param ax: to draw on; a new figure by default
     """
-    ax = panels(width=1.6 + 1.4 * len(summaries))[0] if ax is None else ax
+    ax = panels(width=returns_width(summaries))[0] if ax is None else ax
     for column, (summary, color) in enumerate(zip(summaries, colors(len(summaries)), strict=True)):
         n = len(summary.returns)
         # Spread evenly, not at random, so that the same evaluation draws the same picture.
@@ -147,10 +147,17 @@ def plot_returns(summaries: Sequence[Summary], ax: Axes | None = None) -> Axes:
         value, low, high = _bounds([summary.mean_return])
         ax.errorbar(column, value, yerr=[value - low, high - value], fmt="D", color=color, capsize=5, markersize=6)
         ax.annotate(f"{value[0]:,.0f}", (column, value[0]), (9, 5), textcoords="offset points", color=color)
-    ax.set_xticks(range(len(summaries)), [f"{s.label}\n{len(s.returns)} episodes" for s in summaries])
+    ax.set_xticks(
+        range(len(summaries)), [f"{textwrap.fill(s.label, 15)}\n{len(s.returns)} episodes" for s in summaries]
+    )
     ax.set_xlim(-0.6, len(summaries) - 0.4)
     ax.set_ylabel("return of an episode (undiscounted)")
     return ax
+
+
+def returns_width(summaries: Sequence[Summary]) -> float:
+    """Return the width of a panel of :func:`plot_returns`, in inches."""
+    return 1.6 + 1.4 * len(summaries)
 
 
 def plot_over_delays(table: Mapping[str, Mapping[int | str, npt.ArrayLike]], title: str = "") -> list[Axes]:
@@ -168,8 +175,10 @@ def plot_over_delays(table: Mapping[str, Mapping[int | str, npt.ArrayLike]], tit
     kinds: list[Sequence[int | str]] = [kind for kind in (fixed, random) if kind]
     if not kinds:
         raise ValueError(f"Nothing was played, got {table}; give each agent returns under some delay.")
-    legend_rows = math.ceil(len(table) / 2)
-    axes = panels(len(kinds), title, width=max(5.0, 1.3 * len(random)), height=3.4 + 0.2 * legend_rows)
+    width = max(5.0, 1.3 * len(random))
+    fits_twice = max(map(len, table)) < 4.5 * len(kinds) * width
+    legend_rows = math.ceil(len(table) / 2) if fits_twice else len(table)
+    axes = panels(len(kinds), title, width, height=3.4 + 0.2 * legend_rows)
     for ax, kind in zip(axes, kinds, strict=True):
         for i, (color, (agent, row)) in enumerate(zip(colors(len(table)), table.items(), strict=True)):
             played = [delay for delay in kind if delay in row]
@@ -193,7 +202,7 @@ def plot_over_delays(table: Mapping[str, Mapping[int | str, npt.ArrayLike]], tit
     axes[0].autoscale_view()  # sharing alone keeps the limits of the first panel
     axes[0].set_ylabel("return of an episode (undiscounted)")
     handles, labels = axes[0].get_legend_handles_labels()
-    axes[0].figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
+    axes[0].figure.legend(handles, labels, loc="outside lower center", ncols=1 + fits_twice, frameon=False)
     return axes
 
 

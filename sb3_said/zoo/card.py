@@ -64,6 +64,8 @@ def main(argv: list[str] | None = None) -> None:
     with explained(parser):
         if args.latency is not None and not 0 < args.latency < math.inf:
             raise ValueError(f"--latency is a time in milliseconds, above 0, got {args.latency}.")
+        if args.agent.is_dir():
+            raise ValueError(f"{args.agent} is a folder: give the agent's file, such as {args.agent / 'agent.zip'}.")
         check_writable(target)
         if target.is_file() and not target.read_bytes().startswith(CARD_BEGINS):
             raise ValueError(f"{target} is no model card, and would be replaced: give another --output.")

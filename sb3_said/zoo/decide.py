@@ -42,7 +42,8 @@ examples:
 At temperature 0 the planner draws one candidate from no noise, and no critic is asked. Above 0 it draws several: the
 critics score them, and the best decides (--choice-factor none), or the mean of all does, each weighed by
 exp(factor * its score in standard deviations). sb3-said tune searches for temperature, steps and choice factor.
-What was not given stays as it is. The file given is left as it is, unless -o names it.
+What was not given stays as it is, but --compact has to be given again. The file given is left as it is, unless -o
+names it.
 {TRUST}
 """
 

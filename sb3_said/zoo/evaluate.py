@@ -243,7 +243,7 @@ def draw(path: Path, summaries: list[Summary], folder: Path, title: str) -> None
         for kind in ("present", "action")
         if any(f"planner/{kind}_error" in header for header in headers)
     ]
-    axes = plots.panels(len(drawings), title)
+    axes = plots.panels(len(drawings), title, width=max(5.0, plots.returns_width(summaries)))
     for ax, drawing in zip(axes, drawings, strict=True):
         drawing(ax=ax)
     plots.save(axes[0], path)

@@ -183,7 +183,7 @@ def open_study(
             if study.get_trials(deepcopy=False) or study.direction != optuna.study.StudyDirection.MAXIMIZE:
                 raise ValueError(f"Study {name!r} in {storage} is of something else: give another --study-name.")
             study.set_user_attr("settings", settings)
-    advice = "Go on with the old ones, or begin another study with --study-name."
+    advice = "Go on with the old ones, or give another --output, and with --storage another --study-name."
     check_same(f"Study {name!r} in {storage} was begun", study.user_attrs["settings"], settings, advice)
     return study
 

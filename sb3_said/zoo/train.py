@@ -50,6 +50,8 @@ folder. Ctrl-C, SIGTERM and SIGHUP write a checkpoint before they end the traini
 Below: the options of rl_zoo3. -optimize is for sac, sa, dr, sadr and stable, --save-replay-buffer not for logs.
 """
 
+TEXT = "A VALUE is Python, so that text has quotes of its own: -params \"policy:'MlpPolicy'\"."
+
 
 def budget(word: str) -> int:
     """Return the number of steps, or rl_zoo3's -1, which leaves it to the preset."""
@@ -113,7 +115,8 @@ def main(argv: list[str] | None = None) -> None:
     argv = sys.argv[1:] if argv is None else argv
     with explained(parser):
         run, algo, zoo_argv = read_command_line(argv)
-    if run.resume is not None and len(argv) <= 2 and (run.resume / ENDED_NAME).is_file():  # --resume alone
+    is_alone = len([word for word in argv if word not in ("-P", "--progress")]) <= 2  # --resume RUN_DIR
+    if run.resume is not None and is_alone and (run.resume / ENDED_NAME).is_file():
         play = shlex.join(["sb3-said", "evaluate", str(run.resume)])
         print(f"{run.resume} has ended, and nothing is left to do. {play} plays its agent.")
         if algo == "said" and run.dataset:
@@ -140,6 +143,7 @@ def main(argv: list[str] | None = None) -> None:
         if made:
             raise
         mend = f": {TO_IMPORT}" * isinstance(error, ImportError)
+        mend += f". {TEXT}" * isinstance(error, (NameError, SyntaxError))
         parser.error(f"{error}{mend}")  # from the options that rl_zoo3 reads or evaluates
     except KeyboardInterrupt:  # before or after the training, which handles it itself
         parser.exit(130, "\nInterrupted.\n")
@@ -196,7 +200,7 @@ def read_command_line(argv: list[str]) -> tuple[Run, str, list[str]]:
 
 def of_the_start(argv: list[str]) -> dict[str, Any]:
     """Return those of rl_zoo3's options that have no effect once a run has begun, with what they were given."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser = argparse.ArgumentParser(add_help=False)
     options = (("-conf", "--conf-file"), ("-f", "--log-folder"), ("-i", "--trained-agent"))
     for names in (*options, ("--storage",), ("--study-name",), ("--trial-id",)):
         parser.add_argument(*names, dest=names[-1])
@@ -234,8 +238,5 @@ def joined_settings(argv: list[str]) -> list[str]:
     pairs = [(name, word) for name, words in vars(given).items() if name != "--gym-packages" for word in words]
     for name, word in pairs:
         if ":" not in word:
-            raise ValueError(
-                f"{name} takes NAME:VALUE, got {word!r}. A VALUE is Python, so that text has quotes of its own: "
-                f"{name} \"policy:'MlpPolicy'\"."
-            )
+            raise ValueError(f"{name} takes NAME:VALUE, got {word!r}. {TEXT}")
     return [*rest, *(word for name, words in vars(given).items() if words for word in (name, *words))]

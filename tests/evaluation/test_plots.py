@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
 from pathlib import Path
 from typing import Any
@@ -97,6 +98,25 @@ def test_return_over_delay(png: Path) -> None:
     assert len(plots.plot_over_delays(only_fixed)) == 1
     with pytest.raises(ValueError, match="Nothing was played"):
         plots.plot_over_delays({"any": {}})
+
+
+@pytest.mark.parametrize("n_delays", [1, 3])
+def test_nothing_that_is_written_leaves_the_figure(n_delays: int) -> None:
+    """With the labels that commands give by default."""
+    pytest.importorskip("matplotlib")
+    run = "said/HalfCheetah-v5-delay4-seed1_1"
+    table = {f"{run} {who}": {d: [1.0, 2.0] for d in range(n_delays)} for who in ("planner", "expert")}
+    long = f"HalfCheetah-v5 under delay {'DroppedPackets(12, p=0.1), ' * 2}: means of 50 episodes, 95 % intervals"
+    (over,) = plots.plot_over_delays(table, long)
+    names = ["planner, in real time", "planner, latency ignored", "expert, in real time"]
+    for ax in (over, plots.plot_returns([Summary.from_episodes(name, [1.0, 2.0], [1, 1]) for name in names])):
+        figure = ax.figure
+        figure.canvas.draw()
+        texts = [*figure.texts, *(text for legend in figure.legends for text in legend.get_texts())]
+        for extent in (text.get_window_extent() for text in texts):
+            assert figure.bbox.x0 <= extent.x0 and extent.x1 <= figure.bbox.x1
+        ticks = [text.get_window_extent() for text in ax.get_xticklabels()]
+        assert all(left.x1 <= right.x0 for left, right in itertools.pairwise(ticks))
 
 
 def test_planner_errors(tmp_path: Path, png: Path) -> None:

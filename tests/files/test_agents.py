@@ -165,6 +165,9 @@ def test_arguments_of_load(saved, trained, capsys):
         DelayedSAC.load(saved, policy_kwargs={"net_arch": [3]}, device="cpu")
     with pytest.raises(ValueError, match="spaces do not match"):
         DelayedSAC.load(saved, env=gym.make("MountainCarContinuous-v0"), device="cpu")
+    other = {"env": gym.make("MountainCarContinuous-v0"), "custom_objects": {"policy_kwargs": {"net_arch": [3]}}}
+    with pytest.raises(ValueError, match="spaces do not match"):  # which is why no network fits, either
+        DelayedSAC.load(saved, device="cpu", **other)
     with pytest.raises(SavedFileError, match=r"'policy' does not fit: actor.* \(8, 3\).*expected .* \(3, 3\)"):
         DelayedSAC.load(saved, custom_objects={"policy_kwargs": {"net_arch": [3]}}, device="cpu")
     with pytest.raises(TypeError, match="DelayedSAC has no argument gama; did you mean gamma"):

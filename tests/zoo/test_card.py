@@ -93,6 +93,15 @@ def test_a_file_of_something_else_is_no_card_to_replace(
     assert notes.read_text().startswith("# What I noticed")
 
 
+def test_a_folder_in_place_of_the_agents_file_is_refused(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        card.main([str(run), "--run", str(run), "--returns", str(tmp_path / "returns.json")])
+    assert "is a folder: give the agent's file" in capsys.readouterr().err
+    assert not run.with_suffix(".md").exists()
+
+
 def test_a_run_that_did_not_make_the_agent_is_refused(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

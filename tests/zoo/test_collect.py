@@ -324,6 +324,7 @@ def test_a_normalisation_of_another_task_is_said(tmp_path: Path, capsys: pytest.
         ("{run} -o {tmp}/x.npz --steps 0", "--steps must be at least 1"),
         ("{run} random -o {tmp}/x.npz --steps 1", "fewer than there are shares, 2"),
         ("random -o {tmp}/x.npz", "of no task: give --env"),
+        (f"random --env {ENV} --delay 3 --stochastic -o {{tmp}}/x.npz", "--delay, --stochastic: for random actions"),
         ("nowhere -o {tmp}/x.npz", "nowhere does not exist"),
     ],
 )

@@ -94,8 +94,9 @@ def test_a_finished_run_has_nothing_left_to_do_and_else_resumes_to_the_same_agen
 ) -> None:
     copy = Path(shutil.copytree(finished, tmp_path / "copy"))
     before = {file: file.stat().st_mtime_ns for file in copy.rglob("*")}
-    train.main(["--resume", str(copy)])
-    assert f"{copy} has ended, and nothing is left to do" in capsys.readouterr().out
+    for words in ([], ["-P"]):
+        train.main(["--resume", str(copy), *words])
+        assert f"{copy} has ended, and nothing is left to do" in capsys.readouterr().out
     assert {file: file.stat().st_mtime_ns for file in copy.rglob("*")} == before
     (copy / ENDED_NAME).unlink()  # as of one that was killed after its last checkpoint
     train.main(["--resume", str(copy)])
@@ -505,7 +506,16 @@ def test_a_resume_of_fewer_steps_than_there_are_is_refused(finished: Path) -> No
 def test_a_resume_takes_no_option_of_the_start(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for words in "-conf a.yml", "-f x", "--storage x.log", "--study-name s", "--trial-id 3", "-i a.zip", "-uuid":
+    for words in (
+        "-conf a.yml",
+        "-f x",
+        "--log-fol x",
+        "--storage x.log",
+        "--study-name s",
+        "--trial-id 3",
+        "-i a.zip",
+        "-uuid",
+    ):
         with pytest.raises(SystemExit):
             train.main(["--resume", str(finished), *words.split()])
         assert "goes on with the run's own --" in capsys.readouterr().err
@@ -607,6 +617,13 @@ def test_settings_given_twice_are_joined(given: str, read: str) -> None:
 def test_a_setting_without_a_value_is_refused_with_its_form() -> None:
     with pytest.raises(ValueError, match=r"-params takes NAME:VALUE, got 'gamma=0.9'.*policy:'MlpPolicy'"):
         train.joined_settings(["-params", "gamma=0.9"])
+
+
+@pytest.mark.parametrize("words", ["-params policy:MlpPolicy", "-params gamma:", "--env-kwargs max_episode_steps:abc"])
+def test_a_value_that_is_no_python_is_refused_with_its_form(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        train.main(["--algo", "said", "--env", ENV, "--delay", "2", *words.split()])
+    assert "text has quotes of its own: -params" in capsys.readouterr().err
 
 
 def test_a_task_whose_library_is_missing_ends_in_one_line(monkeypatch, tmp_path: Path) -> None:

@@ -280,7 +280,7 @@ def test_another_runs_trials_are_not_its_own(run: Path, tmp_path: Path, capsys: 
     tune.main([str(run), *search])
     with pytest.raises(SystemExit):
         tune.main([str(other), *search])
-    assert "agent was" in (error := capsys.readouterr().err) and "begin another study with --study-name" in error
+    assert "agent was" in (error := capsys.readouterr().err) and "give another --output" in error
 
 
 def test_folders_that_cannot_be_tuned(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
