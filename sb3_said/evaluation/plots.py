@@ -147,9 +147,8 @@ def plot_returns(summaries: Sequence[Summary], ax: Axes | None = None) -> Axes:
         value, low, high = _bounds([summary.mean_return])
         ax.errorbar(column, value, yerr=[value - low, high - value], fmt="D", color=color, capsize=5, markersize=6)
         ax.annotate(f"{value[0]:,.0f}", (column, value[0]), (9, 5), textcoords="offset points", color=color)
-    ax.set_xticks(
-        range(len(summaries)), [f"{textwrap.fill(s.label, 15)}\n{len(s.returns)} episodes" for s in summaries]
-    )
+    names = [s.label.replace(", ", ",\n") + f"\n{len(s.returns)} episodes" for s in summaries]
+    ax.set_xticks(range(len(summaries)), names)
     ax.set_xlim(-0.6, len(summaries) - 0.4)
     ax.set_ylabel("return of an episode (undiscounted)")
     return ax
