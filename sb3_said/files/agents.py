@@ -13,7 +13,7 @@ import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.utils import ConstantSchedule, check_for_correct_spaces, get_device, get_system_info
+from stable_baselines3.common.utils import ConstantSchedule, get_device, get_system_info
 
 from sb3_said.files.archive import (
     PathOrFile,
@@ -177,8 +177,6 @@ class SafeSaveMixin(Learner):
             model.observation_space, model.action_space = observation_space, action_space
             if model.env is None:
                 model.n_envs = saved["n_envs"]
-            else:
-                check_for_correct_spaces(model.env, observation_space, action_space)
             # Where the caller asks for other networks, the file says nothing about their size.
             own_networks = not any(isinstance(value, (dict, type)) for value in (given | kwargs).values())
             with no_larger_than(saved["parameters"]["policy"]) if own_networks else contextlib.nullcontext():
@@ -187,6 +185,8 @@ class SafeSaveMixin(Learner):
             try:
                 restore_agent(model, model._adapt_saved(saved, {*given, *others}))
             except SavedFileError as error:
+                if model.env is not None:
+                    model.set_env(model.env)  # says so where another task is why the networks do not fit
                 told = ", ".join(f"{name}={value!r}" for name, value in others.items())
                 remedy = f"; it was saved with {told}: leave out of the call what its networks depend on"
                 raise SavedFileError(f"{error}{remedy if others else ''}") from error

@@ -183,7 +183,8 @@ def open_run(args: argparse.Namespace) -> tuple[LoadedRun, SAID]:
     :raises ValueError: when it is not a run of SAID with its replay
     """
     if (args.run / TUNED_SETTINGS).is_file():
-        raise ValueError(f"{args.run} is what sb3-said tune found: give the run that it searched.")
+        of_it = f"{args.run.parent}, " * (args.run.parent / RECORD_NAME).is_file()  # unless --output said otherwise
+        raise ValueError(f"{args.run} is what sb3-said tune found: give {of_it}the run that it searched.")
     run = load_run(args.run, device=args.device)
     if not isinstance(run.model, SAID):
         raise ValueError(f"{args.run} is a run of '{run.info['algo']}', which has no planner; give one of --algo said.")

@@ -537,7 +537,7 @@ def test_training_seeds_of_one_label_are_one_row(
     assert "95 % intervals over 3 training seeds of 3 episodes (stratified bootstrap)" in out
     assert f"three seeds: 3 agents, {', '.join(dict.fromkeys(one for one, _ in returns))}" in out
     assert "one: 1 agents" not in out
-    assert titles == [f"{ENV} under delay: means of 3 episodes, 95 % intervals"]
+    assert [title.replace("\n", " ") for title in titles] == [f"{ENV} under delay: means of 3 episodes, 95 % intervals"]
 
 
 def test_other_statistics_of_vec_normalize_make_another_agent(sadr: Path, tmp_path: Path, monkeypatch) -> None:

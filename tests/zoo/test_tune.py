@@ -294,7 +294,12 @@ def test_folders_that_cannot_be_tuned(run: Path, tmp_path: Path, capsys: pytest.
     found = run / "tune"
     found.mkdir()
     write_best(run, found, {}, 5, "chosen")
-    for folder, message in ((run, "has no checkpoint.zip"), (found, f"what sb3-said tune found: give {run}")):
+    elsewhere = Path(shutil.copytree(found, tmp_path / "elsewhere"))
+    for folder, message in (
+        (run, "has no checkpoint.zip"),
+        (found, f"what sb3-said tune found: give {run}"),
+        (elsewhere, "what sb3-said tune found: give the run that it searched"),
+    ):
         (run / CHECKPOINT_NAME).unlink(missing_ok=True)
         with pytest.raises(SystemExit):
             tune.main([str(folder), "--device", "cpu"])
