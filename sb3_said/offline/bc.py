@@ -57,7 +57,7 @@ class BC(OfflineAlgorithm):
         Once weights have learned with a scale, that scale stays.
         """
         super().take_dataset(dataset, progress_bar)
-        if self.policy.state_normalizer is not None and not self.actor.optimizer.state:
+        if self.policy.state_normalizer is not None and not self.has_learned:
             states = self.replay_buffer.window_source(env=self._vec_normalize_env).start_states()  # (N, obs_dim)
             self.policy.state_normalizer.fit(states.to(self.device), 0)
 

@@ -41,6 +41,11 @@ class OfflineAlgorithm(DelayedSAC):
     learns_from_logs: ClassVar[bool] = True
     learns_online: ClassVar[bool] = False
 
+    @property
+    def has_learned(self) -> bool:
+        """Whether the weights have learned, here or in the agent that ``set_parameters`` took them from."""
+        return self._n_updates > 0 or len(self.actor.optimizer.state) > 0
+
     def learn(self: SelfOffline, *args: Any, **kwargs: Any) -> SelfOffline:
         """Learn from the environment, if the subclass can.
 

@@ -61,9 +61,10 @@ def choose(actions: th.Tensor, values: th.Tensor, factor: float | None) -> th.Te
         return actions[th.arange(len(actions), device=actions.device), values.argmax(1)]
     is_allowed = values > -th.inf
     n = is_allowed.sum(1, keepdim=True)
-    mean = th.where(is_allowed, values, 0.0).sum(1, keepdim=True) / n
+    allowed = th.where(is_allowed, values, 0.0)
+    mean = allowed.sum(1, keepdim=True) / n
     off = th.where(is_allowed, values - mean, 0.0)
-    rounding = 1e-6 * th.where(is_allowed, values, 0.0).abs().amax(1, keepdim=True)  # alike values have z = 0
+    rounding = 1e-6 * allowed.abs().amax(1, keepdim=True)  # alike values have z = 0
     deviation = (off.square().sum(1, keepdim=True) / n).sqrt()
     z = th.where(deviation > rounding, off / deviation, 0.0)
     weights = th.where(is_allowed, factor * z, -th.inf).softmax(1)

@@ -23,8 +23,8 @@ class PlannerAgent(OfflineAlgorithm):
 
     @property
     def has_expert(self) -> bool:
-        """Whether actor and critics have learned, here or in the agent that ``set_parameters`` took them from."""
-        return self._n_updates > 0 or len(self.actor.optimizer.state) > 0
+        """Whether actor and critics have learned."""
+        return self.has_learned
 
     @property
     def newest_fraction(self) -> float:

@@ -219,9 +219,9 @@ def open_agents(args: argparse.Namespace) -> Iterator[Share]:
     """
     import_packages(args.gym_packages)
     names = dict.fromkeys(args.agents)
-    if unused := [f"--{name}" for name in ("delay", "stochastic") if getattr(args, name)]:
-        if [*names] == ["random"]:
-            raise ValueError(f"{', '.join(unused)}: for random actions alone this has no effect; leave it out.")
+    unused = [f"--{name}" for name in ("delay", "stochastic") if getattr(args, name)]
+    if unused and [*names] == ["random"]:
+        raise ValueError(f"{', '.join(unused)}: for random actions alone this has no effect; leave it out.")
     runs = {name: open_agent(name, args) for name in names if name != "random"}
     tasks = {run.info["env"]: run for run in runs.values()}
     if len(tasks) > 1:

@@ -211,14 +211,19 @@ def test_the_scale_is_the_datasets_and_is_saved(learned, tmp_path):
     assert th.equal(BC.load(tmp_path / "bc.zip", device="cpu").policy.state_normalizer.mean, normalizer.mean)
 
 
-@pytest.mark.parametrize("are_taken_over", [False, True])
-def test_weights_keep_the_scale_that_they_learned_with(are_taken_over):
-    model, obs = make(), delayed(DELAY).reset(seed=0)[0]
+@pytest.mark.parametrize("how", ["here", "taken over", "from a compact file", "by SGD"])
+def test_weights_keep_the_scale_that_they_learned_with(how, tmp_path):
+    model = make(**({"policy_kwargs": {"optimizer_class": th.optim.SGD}} if how == "by SGD" else {}))
+    obs = delayed(DELAY).reset(seed=0)[0]
     model.learn_offline(demonstrations(4), 5)
     answer = model.predict(obs)[0]
-    if are_taken_over:
+    if how == "taken over":
         parameters, model = model.get_parameters(), make()
         model.set_parameters(parameters)
+    elif how == "from a compact file":
+        model.save(tmp_path / "bc.zip", compact=True)
+        model = BC.load(tmp_path / "bc.zip", env=delayed(DELAY), device="cpu")
+        answer = model.predict(obs)[0]  # in half precision
     data = demonstrations(4)
     model.take_dataset(replace(data, states=data.states / 5, finals=data.finals / 5))
     np.testing.assert_array_equal(model.predict(obs)[0], answer)
