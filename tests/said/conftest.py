@@ -8,7 +8,7 @@ from small_student import taught_agent
 @pytest.fixture(scope="module")
 def trained():
     """A trained agent; tests must leave it as it is."""
-    return make(critic_reads_age=True).learn(40)
+    return make().learn(40)
 
 
 @pytest.fixture

@@ -19,8 +19,8 @@ from sb3_said.delays import UniformDelay
 from sb3_said.said.policies import SAIDPolicy
 
 
-def test_value_is_the_smallest_critic(trained):
-    policy = trained.policy
+def test_value_is_the_smallest_critic():
+    policy = make(critic_reads_age=True).learn(40).policy
     states, actions = th.randn(3, 4, 5, 2), th.rand(3, 4, 5, 1) * 2 - 1
     ages = th.tensor([0, 1, 2])
     seen = {"undelayed_observation": states.reshape(-1, 2), "delay": ages.repeat_interleave(20)[:, None].float()}
