@@ -258,8 +258,10 @@ class SAIDPolicy(DelayedSACPolicy):
         if self.critic.training:  # as SB3 leaves it; Dropout would then draw, and BatchNorm learn from plans
             self.critic.set_training_mode(False)
         flat = states.flatten(0, -2)
-        ages = ages.view(-1, *(1,) * (states.ndim - 2)).expand(states.shape[:-1]).reshape(-1, 1)
-        observation: PyTorchObs = flat if self.replay_space is None else {UNDELAYED: flat, "delay": ages.float()}
+        observation: PyTorchObs = flat
+        if self.replay_space is not None:
+            told = ages.view(-1, *(1,) * (states.ndim - 2)).expand(states.shape[:-1])  # (B, ...)
+            observation = {UNDELAYED: flat, "delay": told.reshape(-1, 1).float()}
         values = th.cat(self.critic(observation, actions.flatten(0, -2)), dim=1).amin(1).view(states.shape[:-1])
         return values if self.return_scale is None else values * self.return_scale.value
 

@@ -19,8 +19,14 @@ from sb3_said.delays import UniformDelay
 from sb3_said.said.policies import SAIDPolicy
 
 
-def test_value_is_the_smallest_critic():
-    policy = make(critic_reads_age=True).learn(40).policy
+@pytest.fixture(scope="module")
+def aged():
+    """A trained agent whose critics read the age; tests must leave it as it is."""
+    return make(critic_reads_age=True).learn(40)
+
+
+def test_value_is_the_smallest_critic(aged):
+    policy = aged.policy
     states, actions = th.randn(3, 4, 5, 2), th.rand(3, 4, 5, 1) * 2 - 1
     ages = th.tensor([0, 1, 2])
     seen = {"undelayed_observation": states.reshape(-1, 2), "delay": ages.repeat_interleave(20)[:, None].float()}
@@ -74,8 +80,8 @@ def test_values_are_those_of_critics_in_use(layer):
 
 
 @pytest.mark.parametrize("delay", [0, 1, 2])
-def test_the_candidate_of_the_highest_value_after_the_decision_answers(trained, delay):
-    policy, planner = trained.policy, trained.policy.planner
+def test_the_candidate_of_the_highest_value_after_the_decision_answers(aged, delay):
+    policy, planner = aged.policy, aged.policy.planner
     obs = rows_of(observe())[delay]  # ages grow from 0 at an episode's start
     assert obs["delay"] == delay
     batch = {key: th.as_tensor(value[None]) for key, value in obs.items()}
@@ -97,7 +103,7 @@ def test_the_candidate_of_the_highest_value_after_the_decision_answers(trained, 
     )
     th.testing.assert_close(plan.values[0], scores)
     chosen = plan.actions[0, scores.argmax(), delay].numpy()
-    np.testing.assert_allclose(answer(trained, obs), 2.0 * chosen, rtol=1e-6, atol=1e-6)  # actions run from -2 to 2
+    np.testing.assert_allclose(answer(aged, obs), 2.0 * chosen, rtol=1e-6, atol=1e-6)  # actions run from -2 to 2
 
 
 def test_at_temperature_0_nothing_is_drawn_and_no_critic_asked(saved, monkeypatch):
