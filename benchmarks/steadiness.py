@@ -25,6 +25,7 @@ import numpy as np
 from measure import print_table
 
 from sb3_said.files.atomic import write_json
+from sb3_said.zoo.arguments import explained
 
 BAD = 0.7  # of the median, as results/stable_expert.md counts
 EVALUATIONS = "evaluations.npz"  # of SB3's EvalCallback
@@ -38,6 +39,8 @@ def read_runs(name: str, path: Path) -> list[dict[str, Any]]:
     """
     if path.is_file():
         runs = json.loads(path.read_text())
+        if not isinstance(runs, list):
+            raise ValueError(f"{path} was not written by --json of this program, and is no run's folder.")
         if found := [run for run in runs if name in ("", run["name"])]:
             return found
         raise ValueError(f"{path} has no runs named {name!r}, only {', '.join(sorted({run['name'] for run in runs}))}.")
@@ -103,11 +106,9 @@ def main(argv: list[str] | None = None) -> dict[str, dict[str, Any]]:
     groups: dict[str, list[dict[str, Any]]] = {}
     for word in args.runs:
         name, _, path = word.rpartition("=")
-        try:
+        with explained(p):
             for run in read_runs(name, Path(path)):
                 groups.setdefault(run["name"], []).append(run)
-        except ValueError as error:
-            p.error(str(error))
     rows = {name: steadiness(runs, args.last) for name, runs in groups.items()}
     if args.each is None:
         table = [_of_seeds(name, row) for name, row in rows.items()]

@@ -62,6 +62,7 @@ from sb3_said.planner.inpainting import newest
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.said.ways import WAYS
 from sb3_said.zoo.answer import BEST_NAME, EXPERT_FOLDER
+from sb3_said.zoo.arguments import explained
 from sb3_said.zoo.record import Record
 
 EXPERT = ("expert, last", "expert, average")
@@ -282,7 +283,9 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     p.add_argument("--json", type=Path, required=True, help="file of the numbers, read and written")
     args = p.parse_args(argv)
     th.set_num_threads(args.num_threads)
-    model = open_run(args.run, args.device) if args.log is None else open_with_log(args.run, args.log, args.device)
+    with explained(p):
+        is_run = args.log is None
+        model = open_run(args.run, args.device) if is_run else open_with_log(args.run, args.log, args.device)
     preset = preset_of(model, args)
     if preset.first_guess == "none" and {"guessed present", GUESS_ALONE} & {*args.rows}:
         p.error(f"This planner has no first guess: leave 'guessed present' and {GUESS_ALONE!r} out of --rows.")

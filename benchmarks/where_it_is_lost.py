@@ -43,6 +43,7 @@ from sb3_said.files.atomic import write_json
 from sb3_said.offline import Dataset, load_dataset
 from sb3_said.offline.belief import BeliefOnly
 from sb3_said.replay.windows import mean_and_deviation
+from sb3_said.zoo.arguments import explained
 from sb3_said.zoo.runs import origin
 
 PRESENTS = "presents"  # key of the true states s_{t-D..t}
@@ -211,7 +212,9 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     p.add_argument("--json", type=Path, required=True, help="file of the numbers, read and written")
     args = p.parse_args(argv)
     th.set_num_threads(args.num_threads)
-    run = load_agent(args.run)
+    with explained(p):
+        run = load_agent(args.run)
+        actor = None if args.actor is None else load_agent(args.actor).model
     said: Any = run.model
     if not isinstance(said, SAID):
         p.error(f"{args.run} is a {type(said).__name__}; give a SAID agent.")
@@ -219,9 +222,9 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     settings |= {name: getattr(args, name) for name in ("dataset", "actor", "episodes", "eval_seed", "seed")}
     document = resumed(p, args.json, settings, delays={})
     task = gym.make(said.task or "")
-    data = load_dataset(args.dataset, task.observation_space, task.action_space, said.task, progress_bar=True)
+    with explained(p):
+        data = load_dataset(args.dataset, task.observation_space, task.action_space, said.task, progress_bar=True)
     neighbours = Neighbours(data)
-    actor = None if args.actor is None else load_agent(args.actor).model
 
     def task_of(delay: int) -> gym.Env[Any, Any]:
         return ShowPresents(make_env(said, delay))

@@ -1,6 +1,6 @@
 """sb3-said card, from a clone."""
 
-from sb3_said.zoo.card import main
+from sb3_said.zoo.cli import run
 
 if __name__ == "__main__":
-    main()
+    run("card")

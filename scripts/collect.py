@@ -1,6 +1,6 @@
 """sb3-said collect, from a clone."""
 
-from sb3_said.zoo.collect import main
+from sb3_said.zoo.cli import run
 
 if __name__ == "__main__":
-    main()
+    run("collect")

@@ -1,6 +1,6 @@
 """sb3-said decide, from a clone."""
 
-from sb3_said.zoo.decide import main
+from sb3_said.zoo.cli import run
 
 if __name__ == "__main__":
-    main()
+    run("decide")

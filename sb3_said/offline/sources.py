@@ -203,8 +203,8 @@ def read_minari(source: Any, progress_bar: bool) -> Log:
         except Exception as error:  # Minari and the hub below it raise many kinds
             local = ", ".join(sorted(minari.list_local_datasets())) or "none"
             raise ValueError(
-                f"There is no dataset {source!r}: it is no .npz or .hdf5 file, and Minari says {error!s:.200} "
-                f"Local Minari datasets: {local}."
+                f"There is no dataset {source!r}: it is no .npz or .hdf5 file, and Minari, whose ids are like "
+                f"mujoco/hopper/medium-v0, cannot load it ({error!s:.200}). Local Minari datasets: {local}."
             ) from error
     name, spec = source.spec.dataset_id, source.env_spec
     episodes = tqdm(source.iterate_episodes(), desc=name, total=source.total_episodes, disable=not progress_bar)

@@ -36,6 +36,11 @@ def main() -> None:
     if name not in COMMANDS:
         sys.exit(f"{USAGE}\nsb3-said: error: there is no command {name!r}, expected one of {', '.join(COMMANDS)}.")
     sys.argv = [f"sb3-said {name}", *rest]
+    run(name)
+
+
+def run(name: str) -> None:
+    """Run a command on this process's arguments, or end with what it lacks."""
     try:
         command = importlib.import_module(f"sb3_said.zoo.{name.replace('-', '_')}")
     except KeyboardInterrupt:  # the import takes seconds

@@ -55,3 +55,11 @@ def test_a_run_without_evaluations_is_told(tmp_path: Path, capsys: pytest.Captur
     with pytest.raises(SystemExit):
         steadiness.main([f"x={tmp_path}"])
     assert "train with --eval-freq" in capsys.readouterr().err
+
+
+def test_a_file_of_another_program_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "hopper.json"
+    file.write_text('{"agents": {}}')
+    with pytest.raises(SystemExit):
+        steadiness.main([f"x={file}"])
+    assert "was not written by --json of this program" in capsys.readouterr().err

@@ -13,7 +13,9 @@ import torch as th
 
 pytest.importorskip("rl_zoo3")
 
+import distillation
 import what_diffusion_buys as script
+import where_it_is_lost
 from small_run import ENV, TINY_PLANNER, write_run
 
 from sb3_said import SAID, DelayedObservationWrapper
@@ -188,3 +190,11 @@ def test_the_preset_is_the_first_planners_whichever_the_trial_took():
     assert script.preset_of(model, Namespace(planner_kwargs={})) == preset
     other = script.preset_of(model, Namespace(planner_kwargs={"present": "inpainted"}))
     assert other == replace(preset, present="inpainted")
+
+
+@pytest.mark.parametrize("main", [script.main, distillation.main, where_it_is_lost.main])
+def test_a_wrong_path_is_no_traceback(main, tmp_path, capsys):
+    data = ["--dataset", "log.npz"] if main is where_it_is_lost.main else []
+    with pytest.raises(SystemExit) as stop:
+        main([str(tmp_path / "nowhere"), *data, "--json", str(tmp_path / "rows.json")])
+    assert stop.value.code == 2 and "nowhere" in capsys.readouterr().err

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import runpy
 import subprocess
 import sys
 from configparser import ConfigParser
@@ -49,13 +50,26 @@ def test_a_command_teaches_by_its_own_name(
     assert stop.value.code == 2 and f"sb3-said {name}: error: " in capsys.readouterr().err
 
 
-def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "start", ["import sb3_said.zoo.cli as cli; cli.main()", "import runpy; runpy.run_path({}, run_name='__main__')"]
+)
+def test_without_the_extra_it_says_what_to_install(start: str) -> None:
     code = "import sys; sys.modules['rl_zoo3'] = None; sys.argv = ['sb3-said', 'train']\n"
-    code += "from sb3_said.zoo.cli import main; main()"
+    code += start.format(repr(str(ROOT / "scripts" / "train.py")))
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=120)
     assert done.returncode == 1 and done.stderr == (
         'rl_zoo3 is missing, which sb3-said train needs: pip install "sb3_said[zoo]"\n'
     )
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_a_clone_has_a_script_of_each_command(name: str) -> None:
+    script = ROOT / "scripts" / f"{name.replace('-', '_')}.py"
+    started: list[str] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cli, "run", started.append)
+        runpy.run_path(str(script), run_name="__main__")
+    assert started == [name]
 
 
 def test_ctrl_c_while_it_imports_is_no_traceback() -> None:
