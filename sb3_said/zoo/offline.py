@@ -14,7 +14,8 @@ from sb3_said.files.checkpoint import TrainingCheckpointCallback
 from sb3_said.offline import OfflineAlgorithm
 from sb3_said.said import SAID
 from sb3_said.said.training import planner_checkpoint
-from sb3_said.zoo.manager import DelayedExperimentManager, Run
+from sb3_said.zoo.experiment import Run
+from sb3_said.zoo.manager import DelayedExperimentManager
 
 
 class OfflineExperimentManager(DelayedExperimentManager):

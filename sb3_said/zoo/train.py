@@ -26,8 +26,9 @@ from sb3_said.zoo.arguments import (
     make_parser,
     read_delay,
 )
+from sb3_said.zoo.experiment import Run
 from sb3_said.zoo.folder import TUNED_SETTINGS
-from sb3_said.zoo.manager import DelayedExperimentManager, Run
+from sb3_said.zoo.manager import DelayedExperimentManager
 from sb3_said.zoo.offline import OfflineExperimentManager
 from sb3_said.zoo.presets import PRESETS
 from sb3_said.zoo.record import ENDED_NAME, TO_IMPORT, Record

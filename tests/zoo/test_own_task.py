@@ -18,7 +18,7 @@ from small_task import Drift, pendulum
 from trained_run import ENV, PLANNER, report_quickly, train_here
 
 from sb3_said import DelayedObservationWrapper, DelayedSAC
-from sb3_said.zoo import enjoy, evaluate, manager, over_delays, train, tune
+from sb3_said.zoo import enjoy, evaluate, experiment, manager, over_delays, train, tune
 from sb3_said.zoo.record import WRAPPER, Record
 from sb3_said.zoo.runs import load_run
 
@@ -48,7 +48,7 @@ def test_the_delay_is_around_the_users_own_wrapper(
 
 
 def test_the_experts_other_delay_is_around_the_users_own_wrapper_too(tmp_path: Path) -> None:
-    run = manager.Run(3, "cpu", expert_delay=1)
+    run = experiment.Run(3, "cpu", expert_delay=1)
     made = manager.DelayedExperimentManager(
         run,
         Namespace(),

@@ -18,7 +18,8 @@ from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC, PlannerConfig
 from sb3_said.files.arguments import with_given
 from sb3_said.zoo.algorithms import ALGORITHMS, NESTED
 from sb3_said.zoo.arguments import Delay
-from sb3_said.zoo.manager import DelayedExperimentManager, Run
+from sb3_said.zoo.experiment import Run
+from sb3_said.zoo.manager import DelayedExperimentManager
 from sb3_said.zoo.presets import PRESETS, config_file, preset_overrides
 
 TASKS = ("Ant-v5", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5")

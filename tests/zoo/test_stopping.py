@@ -27,7 +27,7 @@ from sb3_said import SAID
 from sb3_said.files.archive import load_tree
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.sac import StableSAC
-from sb3_said.zoo import manager, train
+from sb3_said.zoo import experiment, manager, train
 from sb3_said.zoo.runs import load_run
 from sb3_said.zoo.stopping import SIGNALS, Stopping, holding_back_ctrl_c
 
@@ -273,13 +273,13 @@ if __name__ == "__main__":
 def test_ctrl_c_while_environments_are_made_is_not_lost(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    made = manager.ExperimentManager.create_envs
+    made = experiment.ExperimentManager.create_envs
 
     def interrupted(*args: Any, **kwargs: Any) -> Any:
         signal.raise_signal(signal.SIGINT)
         return made(*args, **kwargs)
 
-    monkeypatch.setattr(manager.ExperimentManager, "create_envs", interrupted)
+    monkeypatch.setattr(experiment.ExperimentManager, "create_envs", interrupted)
     with pytest.raises(SystemExit) as stop:
         train.main(arguments(tmp_path, "--vec-env", "subproc"))
     assert stop.value.code == 130 and "Interrupted." in capsys.readouterr().err

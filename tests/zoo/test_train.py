@@ -30,7 +30,7 @@ from sb3_said.files.archive import load_tree
 from sb3_said.files.checkpoint import TrainingCheckpointCallback
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.said import trial
-from sb3_said.zoo import manager, train
+from sb3_said.zoo import experiment, manager, train
 from sb3_said.zoo.arguments import Delay
 from sb3_said.zoo.folder import log_suffix
 from sb3_said.zoo.manager import DelayedExperimentManager
@@ -357,12 +357,12 @@ def test_the_delay_range_and_its_flags_reach_the_run(tmp_path: Path) -> None:
     [(None, ""), (4, "-delay4"), ([0, 8], "-delay0-8"), ("UniformDelay(0, 8)", "-delayUniformDelay-0-8")],
 )
 def test_the_log_path_names_the_delay(delay: Delay, name: str) -> None:
-    assert manager.Run(delay, "smoke").name == name
+    assert experiment.Run(delay, "smoke").name == name
 
 
 def test_the_log_path_of_many_logs_is_one_that_a_disk_takes() -> None:
     parts = [f"hopper_medium_replay_part_{k}.npz" for k in range(30)]
-    names = [manager.Run(2, "cpu", dataset=parts[:n]).name for n in (1, 29, 30)]
+    names = [experiment.Run(2, "cpu", dataset=parts[:n]).name for n in (1, 29, 30)]
     assert names[0] == "-delay2-hopper_medium_replay_part_0"
     assert len(set(names)) == 3 and max(map(len, names)) < 120
 

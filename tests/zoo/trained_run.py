@@ -14,7 +14,8 @@ from small_run import ENV
 from sb3_said import SAID
 from sb3_said.zoo import evaluate, train, tune
 from sb3_said.zoo.arguments import Delay
-from sb3_said.zoo.manager import DelayedExperimentManager, Run
+from sb3_said.zoo.experiment import Run
+from sb3_said.zoo.manager import DelayedExperimentManager
 
 NETWORKS = "policy_kwargs:dict(net_arch=[16])"
 PLANNER = "dict(depth=1, d_model=32, horizon=4, sampling_steps=1, n_candidates=2, batch_size=8)"
