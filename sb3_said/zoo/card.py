@@ -20,7 +20,7 @@ from sb3_said.files.atomic import check_writable, write_text
 from sb3_said.files.normalization import normalization_file
 from sb3_said.zoo.arguments import explained, make_parser
 from sb3_said.zoo.cells import Cell, Results
-from sb3_said.zoo.over_delays import digest_of
+from sb3_said.zoo.playing import digest_of
 from sb3_said.zoo.presets import config_file, preset_overrides
 from sb3_said.zoo.record import Record, evaluated
 from sb3_said.zoo.runs import LoadedRun, changes, control_period, load_run, longest_delay

@@ -32,7 +32,7 @@ from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC
 from sb3_said.evaluation import Summary
 from sb3_said.files.normalization import normalization_file, save_normalization
 from sb3_said.offline.scores import REFERENCE_RETURNS
-from sb3_said.zoo import evaluate, over_delays
+from sb3_said.zoo import evaluate, over_delays, playing
 from sb3_said.zoo.cells import Cell, Results
 from sb3_said.zoo.record import Record
 from sb3_said.zoo.runs import load_run
@@ -77,7 +77,7 @@ def by_cell(document: dict[str, Any]) -> dict[tuple[str, Any], Any]:
 def count_plays(monkeypatch: pytest.MonkeyPatch, stop_after: int | None = None) -> list[tuple[str, Any]]:
     """Return a list that will hold the agent and delay of every cell played from now on."""
     played: list[tuple[str, Any]] = []
-    original = over_delays.play
+    original = playing.play
 
     def counted(cell: Cell, *how: Any) -> Summary:
         if len(played) == stop_after:
@@ -85,7 +85,7 @@ def count_plays(monkeypatch: pytest.MonkeyPatch, stop_after: int | None = None) 
         played.append((cell.agent, cell.delay))
         return original(cell, *how)
 
-    monkeypatch.setattr(over_delays, "play", counted)
+    monkeypatch.setattr(playing, "play", counted)
     return played
 
 
@@ -312,17 +312,17 @@ def test_an_agent_of_another_folder_is_no_changed_one(seeds: list[Path], tmp_pat
 
 def test_calls_that_add_to_one_file_at_a_time_lose_nothing(said: Path, sadr: Path, tmp_path: Path, monkeypatch) -> None:
     file = tmp_path / "out.json"
-    original = over_delays.play
+    original = playing.play
 
     def meanwhile(cell: Cell, *how: Any) -> Summary:
         if cell.agent == "one planner":
             with monkeypatch.context() as patch:
-                patch.setattr(over_delays, "play", original)
+                patch.setattr(playing, "play", original)
                 play(file, [f"other={sadr}"], ["0"])
                 play(file, [f"one={said}"], ["1"], "--answer", "expert")
         return original(cell, *how)
 
-    monkeypatch.setattr(over_delays, "play", meanwhile)
+    monkeypatch.setattr(playing, "play", meanwhile)
     document = play(file, [f"one={said}"], ["1"])
     assert {*by_cell(document)} == {("one planner", 1), ("one expert", 1), ("other", 0)}
     for cell in document["cells"]:
@@ -341,7 +341,7 @@ def test_runs_of_one_folder_name_need_labels(seeds: list[Path], tmp_path: Path, 
 
 def test_an_agent_of_a_plain_run_is_its_file(said: Path, tmp_path: Path) -> None:
     (copy := tmp_path / "alone.zip").write_bytes((said / f"{ENV}.zip").read_bytes())
-    digests = {over_delays.digest_of(load_run(path, device="cpu")) for path in (said, copy)}
+    digests = {playing.digest_of(load_run(path, device="cpu")) for path in (said, copy)}
     assert digests == {hashlib.sha256(copy.read_bytes()).hexdigest()}
 
 
@@ -358,7 +358,7 @@ def test_a_worker_that_is_killed_is_told_of(
     def killed(*_: Any, **__: Any) -> Any:
         raise BrokenProcessPool("A process in the process pool was terminated abruptly")
 
-    monkeypatch.setattr(over_delays, "as_completed", killed)
+    monkeypatch.setattr(playing, "as_completed", killed)
     with pytest.raises(SystemExit):
         play(tmp_path / "out.json", [said], ["1"], "--workers", "2")
     assert "fewer --workers. What was played is kept" in capsys.readouterr().err
@@ -375,7 +375,7 @@ def test_a_table_without_a_number_has_no_interval_and_no_plot(
 def die_beside_a_worker(_: Connection) -> None:
     """Begin a worker, which is forked and so holds the pipe, too, and be killed."""
     fork = multiprocessing.get_context("fork")
-    pool = ProcessPoolExecutor(1, fork, initializer=over_delays.begin_worker, initargs=(1,))
+    pool = ProcessPoolExecutor(1, fork, initializer=playing.begin_worker, initargs=(1,))
     assert pool.submit(os.getpid).result() != os.getpid()
     os.kill(os.getpid(), signal.SIGKILL)
 
@@ -401,7 +401,7 @@ def test_ctrl_c_ends_workers_amid_their_cells(starts: bool, sadr: Path, tmp_path
 import os, time
 from multiprocessing import forkserver
 from signal import SIGINT
-from sb3_said.zoo import over_delays
+from sb3_said.zoo import over_delays, playing
 
 def begin(*_):
     print("begun", flush=True)
@@ -414,7 +414,7 @@ def start(fds, start=forkserver.connect_to_new_process):
     return made
 
 if __name__ == "__main__":
-    over_delays.play, forkserver.connect_to_new_process = begin, start
+    playing.play, forkserver.connect_to_new_process = begin, start
     over_delays.main({words!r})
 """
     (script := tmp_path / "command.py").write_text(code)
@@ -454,9 +454,9 @@ def test_only_the_warning_of_another_delay_is_silent(sadr: Path) -> None:
         load_run(sadr, delay=0, device="cpu")
     with warnings.catch_warnings():
         warnings.filterwarnings("error", "This")
-        with over_delays.at_any_age():
+        with playing.at_any_age():
             load_run(sadr, delay=0, device="cpu")
-    with pytest.warns(UserWarning, match="old"), over_delays.at_any_age():
+    with pytest.warns(UserWarning, match="old"), playing.at_any_age():
         warnings.warn("This file is old.", stacklevel=1)
 
 
@@ -486,7 +486,7 @@ def test_the_expert_of_a_planner_of_one_delay_plays_all(said: Path, tmp_path: Pa
 def test_an_agent_that_changes_amid_a_call_ends_it(
     sadr: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run, original = Path(shutil.copytree(sadr, tmp_path / "run")), over_delays.play
+    run, original = Path(shutil.copytree(sadr, tmp_path / "run")), playing.play
 
     def trained_on(*args: Any) -> Any:
         result = original(*args)
@@ -495,7 +495,7 @@ def test_an_agent_that_changes_amid_a_call_ends_it(
         model.save(run / f"{ENV}.zip")
         return result
 
-    monkeypatch.setattr(over_delays, "play", trained_on)
+    monkeypatch.setattr(playing, "play", trained_on)
     with pytest.raises(SystemExit):
         play(tmp_path / "out.json", [f"x={run}"], ["0", "1"])
     assert f"{ENV}.zip has changed since this call began" in capsys.readouterr().err
