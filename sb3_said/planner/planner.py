@@ -223,8 +223,8 @@ class InpaintingPlanner(nn.Module):
         :param observation: (B, obs_dim) delayed observations s_{t-d}
         :param action_history: (B, D, act_dim), the D newest actions, oldest first
         :param delay: (B,) integers d in 0..D, not necessarily alike
-        :param value_fn: maps states (B, N, K, obs_dim) and actions (B, N, K, act_dim), environment units, and the ages
-            (B,) of ``delay``, to values (B, N, K); without it all values are 0 and the first candidate is taken
+        :param value_fn: maps states (B, N, K, obs_dim) and actions (B, N, K, act_dim), environment units, to values
+            (B, N, K); without it all values are 0 and the first candidate is taken
         :param n_candidates: N; this and the next two by default as in the config
         :param sampling_steps: denoising steps
         :param temperature: factor on the initial noise
@@ -435,8 +435,7 @@ class InpaintingPlanner(nn.Module):
         states, actions = self._guess_window(given, known, delay)[0], given[..., self.obs_dim :]
         rows, now = th.arange(len(x), device=x.device), th.zeros_like(delay)
         ahead = x[:, :, : self.config.horizon]
-        aged: ValueFn | None = None if value_fn is None else lambda states, actions, _: value_fn(states, actions, delay)
-        plan = self._inpaint(steps, aged, 0, False, times, states[rows, delay], action_history, now, ahead)
+        plan = self._inpaint(steps, value_fn, 0, False, times, states[rows, delay], action_history, now, ahead)
         step = th.arange(x.shape[2], device=x.device) - delay[:, None]  # (B, L), since the present
         index = step.clamp(0, self.config.horizon - 1)[:, None, :, None].expand(*x.shape[:3], -1)
         is_past = (step < 0)[:, None, :, None]

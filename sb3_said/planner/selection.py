@@ -8,9 +8,8 @@ import torch as th
 
 from sb3_said.planner.config import PlannerConfig
 
-#: Maps states (B, N, K, obs_dim) and actions (B, N, K, act_dim), in environment units, and the age (B,) at which each
-#: decision is made, to values (B, N, K)
-ValueFn = Callable[[th.Tensor, th.Tensor, th.Tensor], th.Tensor]
+#: Maps states (B, N, K, obs_dim) and actions (B, N, K, act_dim), in environment units, to values (B, N, K)
+ValueFn = Callable[[th.Tensor, th.Tensor], th.Tensor]
 
 
 def score(
@@ -26,21 +25,20 @@ def score(
     if config.scored_states == "decision":
         rows = th.arange(len(states), device=states.device)
         present, decisions = states[rows, :, delay].mean(1, keepdim=True), actions[rows, :, delay]  # (B, 1 or N, dim)
-        present = present.expand(-1, states.shape[1], -1)  # (B, N, obs_dim)
-        return _value_of(value_fn, present[:, :, None], decisions[:, :, None], delay)[..., 0]
+        return _value_of(value_fn, present.expand(-1, states.shape[1], -1)[:, :, None], decisions[:, :, None])[..., 0]
     before, first = (delay, shortest + 1) if config.scored_states == "future" else (0 * delay, 1)
-    values = _value_of(value_fn, states[:, :, first:], actions[:, :, first:], delay)  # (B, N, L - first)
+    values = _value_of(value_fn, states[:, :, first:], actions[:, :, first:])  # (B, N, L - first)
     steps = th.arange(first, states.shape[2], device=states.device)
     scored = ((steps > before[:, None]) & (steps < delay[:, None] + config.horizon))[:, None]  # (B, 1, L - first)
     return th.where(scored, values, 0.0).sum(-1) / scored.sum(-1)
 
 
-def _value_of(value_fn: ValueFn, states: th.Tensor, actions: th.Tensor, delay: th.Tensor) -> th.Tensor:
+def _value_of(value_fn: ValueFn, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
     """Return the value of each step: (B, N, K) float32.
 
     :raises ValueError: when the function returns another shape
     """
-    values = value_fn(states, actions, delay).float()
+    values = value_fn(states, actions).float()
     if values.shape != states.shape[:-1]:
         raise ValueError(
             f"value_fn returned the shape {tuple(values.shape)}, expected one value per state, "

@@ -15,7 +15,7 @@ def returns_to_go(
     source: WindowSource,
     gamma: float,
     terminal_penalty: float | None = None,
-    value_fn: Callable[[th.Tensor, th.Tensor, th.Tensor], th.Tensor] | None = None,
+    value_fn: Callable[[th.Tensor, th.Tensor], th.Tensor] | None = None,
 ) -> th.Tensor:
     """Return the discounted return to go of every start, bootstrapped where its episode was cut off.
 
@@ -24,10 +24,10 @@ def returns_to_go(
     :param source: M starts
     :param gamma: discount factor
     :param terminal_penalty: replaces the reward of a terminating step (paper, Table 3); None keeps it
-    :param value_fn: (states (K, obs_dim), actions (K, act_dim), ages (K,)) -> (K,), the value of the last stored step
-        of an episode that was cut off; ages that are not known are 0. Without it such an episode is taken to go on at
-        its average reward. In the average of an episode shorter than the horizon 1 / (1 - gamma), the mean reward of
-        all steps that do not terminate stands for the missing ones: few steps tell little
+    :param value_fn: (states (K, obs_dim), actions (K, act_dim)) -> (K,), the value of the last stored step of an
+        episode that was cut off. Without it such an episode is taken to go on at its average reward. In the average of
+        an episode shorter than the horizon 1 / (1 - gamma), the mean reward of all steps that do not terminate stands
+        for the missing ones: few steps tell little
     :return: (M,) float32
     :raises ValueError: for gamma = 1 without ``value_fn`` where an episode was cut off: it has no finite value
     """
@@ -37,8 +37,7 @@ def returns_to_go(
     if terminal_penalty is not None:
         rewards[terminated] = terminal_penalty
     if value_fn is not None:
-        ages = th.zeros_like(source.rows) if source.ages is None else source.ages
-        rewards[cut] = value_fn(source.start_states()[cut], source.start_actions()[cut], ages[cut]).float()
+        rewards[cut] = value_fn(source.start_states()[cut], source.start_actions()[cut]).float()
     elif gamma < 1.0:
         _, episode = source.episodes.unique(return_inverse=True)
         length, horizon = episode.bincount(), 1.0 / (1.0 - gamma)

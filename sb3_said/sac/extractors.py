@@ -55,21 +55,6 @@ class KeyExtractor(BaseFeaturesExtractor):
         return self.normalizer(observations[self.key])
 
 
-class AgedStateExtractor(KeyExtractor):
-    """Concatenate [true state, age / D], for a critic of actors that act at many ages.
-
-    Without the age a critic holds values of an actor whose age is drawn anew at each step.
-    """
-
-    def __init__(self, observation_space: spaces.Dict, key: str, normalizer: StateNormalizer | None = None):
-        super().__init__(observation_space, key, normalizer)
-        self.max_delay = observation_space["action_history"].shape[0]  # type: ignore[index]
-        self._features_dim += 1
-
-    def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
-        return th.cat([super().forward(observations), observations["delay"] / max(self.max_delay, 1)], dim=1)
-
-
 class NormalizedExtractor(BaseFeaturesExtractor):
     """Hand z-scores of a 1-D Box observation, that of a task without delay, to another extractor.
 

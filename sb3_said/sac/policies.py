@@ -25,7 +25,7 @@ from sb3_said.delays.space import UNDELAYED, check_spaces, holds_whole_numbers, 
 from sb3_said.files.agents import SafePolicyMixin
 from sb3_said.files.arguments import instead_of
 from sb3_said.sac.episodes import TrainingEpisodes
-from sb3_said.sac.extractors import AgedStateExtractor, KeyExtractor, NormalizedExtractor, StateAugmentedExtractor
+from sb3_said.sac.extractors import KeyExtractor, NormalizedExtractor, StateAugmentedExtractor
 from sb3_said.sac.scaling import ReturnScale, StateNormalizer
 
 NOT_FINITE = (
@@ -35,7 +35,7 @@ NOT_FINITE = (
 
 #: Arguments of the policy that the algorithm must serve in training; only ``StableSAC`` serves them all
 SERVED = ("normalise_states", "scale_rewards", "average_actor")
-OWN_ARGUMENTS = ("augment_state", "delay_reconciled_critic", "critic_reads_age", "critic_layer_norm", *SERVED)
+OWN_ARGUMENTS = ("augment_state", "delay_reconciled_critic", "critic_layer_norm", *SERVED)
 
 
 class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
@@ -44,7 +44,6 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
     :param augment_state: the actor reads [observation, action history, age] instead of the observation alone
     :param delay_reconciled_critic: the critics read the true state, which only replay knows, instead of what the actor
         reads
-    :param critic_reads_age: critics of the true state read the observation's age, too
     :param normalise_states: actor and critics read z-scores of states
         (see :class:`~sb3_said.sac.scaling.StateNormalizer`)
     :param scale_rewards: the critics' values are in units of a :class:`~sb3_said.sac.scaling.ReturnScale`
@@ -64,7 +63,6 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         *,
         augment_state: bool = True,
         delay_reconciled_critic: bool = True,
-        critic_reads_age: bool = False,
         normalise_states: bool = False,
         scale_rewards: bool = False,
         average_actor: bool = False,
@@ -74,7 +72,6 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
         state_space, _, self.max_delay = check_spaces(observation_space, action_space)
         self.augment_state = augment_state
         self.delay_reconciled_critic = delay_reconciled_critic
-        self.critic_reads_age = critic_reads_age
         self.normalise_states = normalise_states
         self.scale_rewards = scale_rewards
         self.average_actor = average_actor
@@ -156,8 +153,7 @@ class DelayedSACPolicy(SafePolicyMixin, SACPolicy):
             return NormalizedExtractor(self.make_features_extractor(), self.state_normalizer)
         if self.augment_state and key != UNDELAYED:
             return StateAugmentedExtractor(self.replay_space, self.state_normalizer)
-        extractor = AgedStateExtractor if self.critic_reads_age and key == UNDELAYED else KeyExtractor
-        return extractor(self.replay_space, key, self.state_normalizer)
+        return KeyExtractor(self.replay_space, key, self.state_normalizer)
 
     def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
         """Check what ``predict`` was given, and copy it into float32 tensors.

@@ -51,10 +51,6 @@ class StableSAC(DelayedSAC):
     :param actor_averaging: decay of the actor's average in each of its updates, in [0, 1); 0 for no average
     :param ent_coef: SAC's, in units of scaled rewards
     :param target_entropy: SAC's; ``"half"`` is -act_dim / 2, ``"auto"`` is -act_dim
-    :param critic_reads_age: the critics read the observation's age beside the true state. What a state is worth
-        depends on who goes on from there: an actor that sees old states may fall where one that sees new ones walks.
-        Being measured where delays vary (results/expert_parts.md); under one fixed delay it changes an episode's first
-        steps alone
     :param critic_layer_norm: a LayerNorm follows each hidden layer of the critics, so that these bear
         ``gradient_steps=2`` (DroQ, https://arxiv.org/abs/2110.02034). HalfCheetah-v5, whose episodes do not end by a
         fall, learns faster with it; Hopper-v5 does not, and Walker2d-v5 falls for longer (results/expert_parts.md)
@@ -77,7 +73,6 @@ class StableSAC(DelayedSAC):
         actor_averaging: float = 0.9998,
         ent_coef: str | float = "auto_0.01",
         target_entropy: str | float = "half",
-        critic_reads_age: bool = False,
         critic_layer_norm: bool = False,
         **sac_kwargs: Any,
     ):
@@ -89,7 +84,6 @@ class StableSAC(DelayedSAC):
         self.normalise_states = normalise_states
         self.policy_delay = policy_delay
         self.actor_averaging = actor_averaging
-        self.critic_reads_age = critic_reads_age
         self.critic_layer_norm = critic_layer_norm
         self._running_returns = np.zeros(1)  # (n_envs,) G_t of the episodes that are being played
         self._paid = np.zeros(1)  # (n_envs,) the same, undiscounted and in the task's own rewards
@@ -112,7 +106,6 @@ class StableSAC(DelayedSAC):
             "normalise_states": self.normalise_states,
             "scale_rewards": self.scale_rewards,
             "average_actor": self.actor_averaging > 0.0,
-            "critic_reads_age": self.critic_reads_age,
             "critic_layer_norm": self.critic_layer_norm,
         }
 

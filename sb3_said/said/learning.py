@@ -242,10 +242,10 @@ class PlannerLearner(PlannerAgent):
             raise ValueError("decided_by='actor' lets the expert's actor decide, which this agent has not trained.")
 
     @th.no_grad()
-    def _stored_values(self, states: th.Tensor, actions: th.Tensor, ages: th.Tensor) -> th.Tensor:
-        """Return Q(s, a), in units of the environment's rewards, for states, actions and ages of windows: (B,)."""
+    def _stored_values(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """Return Q(s, a) in units of the environment's rewards, for states and actions of windows: (B,)."""
         self.critic.set_training_mode(False)  # until the next update; batch norm must not learn from this
-        values = self.policy.q_value(*(x.to(self.device) for x in (states, actions, ages))).cpu()
+        values = self.policy.q_value(states.to(self.device), actions.to(self.device)).cpu()
         env = self._vec_normalize_env
         return values if env is None else th.from_numpy(env.unnormalize_reward(values.numpy()))
 

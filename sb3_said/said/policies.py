@@ -243,25 +243,21 @@ class SAIDPolicy(DelayedSACPolicy):
         if who == "student" and "student" not in self.answers:
             raise ValueError("There is no student yet; call distill() first.")
 
-    def value(self, states: th.Tensor, actions: th.Tensor, ages: th.Tensor) -> th.Tensor:
+    def value(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """Return V(s), or min over the critics of Q(s, a), which scores candidates (MCSS).
 
-        :param states: (B, ..., obs_dim)
-        :param actions: (B, ..., act_dim) in [-1, 1]; V(s) does not read them
-        :param ages: (B,) of the observations that the expert goes on with; only critics that read ages do
-        :return: (B, ...)
+        :param states: (..., obs_dim)
+        :param actions: (..., act_dim) in [-1, 1]; V(s) does not read them
+        :return: (...)
         """
-        return self.q_value(states, actions, ages) if self.values is None else self.values.value(states)
+        return self.q_value(states, actions) if self.values is None else self.values.value(states)
 
-    def q_value(self, states: th.Tensor, actions: th.Tensor, ages: th.Tensor) -> th.Tensor:
-        """Return min over the critics of Q(s, a), in units of the rewards that they learn from: (B, ...)."""
+    def q_value(self, states: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """Return min over the critics of Q(s, a), in units of the rewards that they learn from: (...)."""
         if self.critic.training:  # as SB3 leaves it; Dropout would then draw, and BatchNorm learn from plans
             self.critic.set_training_mode(False)
         flat = states.flatten(0, -2)
-        observation: PyTorchObs = flat
-        if self.replay_space is not None:
-            told = ages.view(-1, *(1,) * (states.ndim - 2)).expand(states.shape[:-1])  # (B, ...)
-            observation = {UNDELAYED: flat, "delay": told.reshape(-1, 1).float()}
+        observation: PyTorchObs = flat if self.replay_space is None else {UNDELAYED: flat}
         values = th.cat(self.critic(observation, actions.flatten(0, -2)), dim=1).amin(1).view(states.shape[:-1])
         return values if self.return_scale is None else values * self.return_scale.value
 

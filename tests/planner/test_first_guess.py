@@ -327,14 +327,7 @@ def test_a_guess_is_where_a_plan_begins_and_what_the_clone_does_there(guessing: 
 def test_a_plan_from_the_guessed_present_is_another_one_and_its_candidates_are_chosen(guessing: InpaintingPlanner):
     observation, history, delay = th.ones(2, STATE_DIM), th.ones(2, D, ACTION_DIM), th.tensor([D, D])
     asked = dict(noise=th.randn(3, L, STATE_DIM + ACTION_DIM, generator=th.Generator().manual_seed(0)), temperature=1.0)
-    asked_at = []
-
-    def first_entry(states, actions, ages):
-        asked_at.append(ages)
-        return actions[..., 0]
-
-    by_action = guessing.plan(observation, history, delay, first_entry, **asked)
-    assert th.equal(asked_at[0], delay)  # the age of what is known, not that of the guess
+    by_action = guessing.plan(observation, history, delay, lambda _, actions: actions[..., 0], **asked)
     assert th.equal(by_action.action[:, 0], by_action.actions[:, :, D, 0].max(1).values)
     guessing.config = replace(guessing.config, present="inpainted")
     assert not th.allclose(guessing.plan(observation, history, delay, **asked).action, by_action.action, atol=1e-3)

@@ -100,7 +100,7 @@ def test_selection_by_value_approaches_the_best_plan(trainer):
         return -present(observation, history, delay) @ K.T
 
     def planned(observation, history, delay):
-        value = lambda states, *_: -(states @ P * states).sum(-1)  # noqa: E731
+        value = lambda states, actions: -(states @ P * states).sum(-1)  # noqa: E731
         plan = trainer.planner.plan(
             observation, history, delay, value_fn=value, n_candidates=16, temperature=1.0, generator=generator
         )

@@ -239,11 +239,8 @@ def test_selection_scores_the_right_states_and_takes_the_best(scored_states):
     planner = make_planner(scored_states=scored_states)
     observation, history, delay = make_batch(20)
 
-    def worth(state, action, age):
-        return state.sin().sum(-1) + (1 + age) * action.prod(-1)
-
-    def value_fn(states, actions, ages):
-        return worth(states, actions, ages[:, None, None])
+    def value_fn(states, actions):
+        return states.sin().sum(-1) + actions.prod(-1)
 
     plan = planner.plan(observation, history, delay, value_fn, n_candidates=7, generator=seeded())
     best = []
@@ -251,8 +248,7 @@ def test_selection_scores_the_right_states_and_takes_the_best(scored_states):
         first = d + 1 if scored_states == "future" else 1
         scores = []
         for n in range(7):
-            steps = range(first, d + SMALL.horizon)
-            marks = [worth(plan.states[b, n, k], plan.actions[b, n, k], d) for k in steps]
+            marks = [value_fn(plan.states[b, n, k], plan.actions[b, n, k]) for k in range(first, d + SMALL.horizon)]
             scores.append(sum(marks) / len(marks))
         th.testing.assert_close(plan.values[b], th.stack(scores), atol=1e-5, rtol=1e-4)
         best.append(int(th.stack(scores).argmax()))
@@ -263,7 +259,7 @@ def test_selection_scores_the_right_states_and_takes_the_best(scored_states):
 @pytest.mark.parametrize("factor", [0.0, 0.7, 3.0])
 def test_candidates_can_be_averaged_by_their_values(factor):
     planner, batch = make_planner(choice_factor=factor), make_batch(6)
-    plan = planner.plan(*batch, value_fn=lambda s, a, _: s.sum(-1) + a[..., 0], generator=seeded())
+    plan = planner.plan(*batch, value_fn=lambda s, a: s.sum(-1) + a[..., 0], generator=seeded())
     for b, d in enumerate(batch[2].tolist()):
         values, actions = plan.values[b].double().numpy(), plan.actions[b, :, d].double().numpy()
         weights = np.exp(factor * (values - values.mean()) / values.std())
@@ -294,9 +290,8 @@ def test_the_decision_alone_is_scored_at_the_present_that_all_candidates_share()
     observation, history, delay = make_batch(6)
     seen = []
 
-    def value_fn(states, actions, ages):
+    def value_fn(states, actions):
         seen.append((states, actions))
-        assert th.equal(ages, delay)
         return states.sum(-1) + actions[..., 0]
 
     plan = planner.plan(observation, history, delay, value_fn=value_fn, generator=seeded())
@@ -312,9 +307,9 @@ def test_the_decision_alone_is_scored_at_the_present_that_all_candidates_share()
 def test_value_function_must_give_one_number_per_state():
     planner, batch = make_planner(), make_batch(2)
     with pytest.raises(ValueError, match="drop a last dimension of 1"):
-        planner.plan(*batch, value_fn=lambda states, *_: states[..., :1])
+        planner.plan(*batch, value_fn=lambda states, actions: states[..., :1])
     with pytest.raises(ValueError, match="value_fn returned NaN"):
-        planner.plan(*batch, value_fn=lambda states, *_: states[..., 0] * th.nan)
+        planner.plan(*batch, value_fn=lambda states, actions: states[..., 0] * th.nan)
 
 
 @pytest.mark.parametrize("factor", [None, 1.5])
@@ -322,12 +317,12 @@ def test_a_value_of_minus_infinity_forbids_a_candidate(factor):
     settings = {"n_candidates": 9, "temperature": 1.0, "scored_states": "decision"}
     planner, batch = make_planner(choice_factor=factor, **settings), make_batch(4)
 
-    def allowed_value(states, actions, _):
+    def allowed_value(states, actions):
         middle = actions[..., 0].median(1, keepdim=True).values
         return th.where(actions[..., 0] < middle, states.sum(-1) + actions[..., 1], -th.inf)
 
     with pytest.raises(ValueError, match="-inf for all, so that no candidate is the best"):
-        planner.plan(*batch, value_fn=lambda states, *_: th.full_like(states[..., 0], -th.inf))
+        planner.plan(*batch, value_fn=lambda states, _: th.full_like(states[..., 0], -th.inf))
     plan, rows = planner.plan(*batch, value_fn=allowed_value, generator=seeded()), th.arange(4)
     assert plan.values.isinf().any() and plan.values.isfinite().any(1).all()
     for row in rows:
@@ -340,7 +335,7 @@ def test_a_value_of_minus_infinity_forbids_a_candidate(factor):
         th.testing.assert_close(plan.action[row], expected)
     for value in (-th.inf, th.inf):
         with pytest.raises(ValueError, match="-inf for all, so that no candidate is the best"):
-            make_planner(choice_factor=1.0).plan(*batch, value_fn=lambda states, *_, x=value: states[..., 0] * 0 + x)
+            make_planner(choice_factor=1.0).plan(*batch, value_fn=lambda states, _, x=value: states[..., 0] * 0 + x)
     with pytest.raises(ValueError, match="temperature inf, expected"):
         planner.plan(*batch, temperature=float("inf"))
 
@@ -362,7 +357,7 @@ def test_number_of_candidates_and_steps_can_be_set_per_call():
     planner, batch, calls = make_planner(), make_batch(2), []
     planner.network.register_forward_hook(lambda *_: calls.append(1))
 
-    def value_fn(states, actions, ages):
+    def value_fn(states, actions):
         return states[..., 0]
 
     assert planner.plan(*batch, value_fn).values.shape == (2, 5) and len(calls) == 3

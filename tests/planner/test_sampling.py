@@ -50,8 +50,8 @@ def make_inputs(n=3, seed=0):
     return 3 + 2 * th.randn(n, OBS, generator=g), history, th.arange(n) % (DELAY + 1), noise
 
 
-def value(states, actions, ages):
-    return states.sin().sum(-1) + (1 + ages[:, None, None]) * actions.prod(-1)
+def value(states, actions):
+    return states.sin().sum(-1) + actions.prod(-1)
 
 
 def answer(planner, inputs=None, **kwargs):
@@ -147,7 +147,7 @@ def test_fast_path_gives_what_a_naive_one_gives():
         states, actions = planner.normalizer.denormalize(x)
         assert ((plan.states[b, :, : states.shape[1]] - states) / planner.normalizer.state_std).abs().max() < 1e-4
         th.testing.assert_close(plan.actions[b, :, : states.shape[1]], actions, atol=1e-4, rtol=1e-4)
-        values = value(states[None], actions[None], th.tensor([d]))[0, :, d + 1 :].mean(1)
+        values = value(states, actions)[:, d + 1 :].mean(1)
         th.testing.assert_close(plan.values[b], values, atol=1e-3, rtol=1e-3)
         chosen.append(int(values.argmax()))
         th.testing.assert_close(plan.action[b], actions[chosen[-1], d], atol=1e-4, rtol=1e-4)
@@ -193,8 +193,8 @@ class Value(th.nn.Module):
         super().__init__()
         self.weight = th.nn.Parameter(th.ones(OBS))
 
-    def forward(self, states, actions, ages):
-        return states.sin() @ self.weight + (1 + ages[:, None, None]) * actions.prod(-1)
+    def forward(self, states, actions):
+        return states.sin() @ self.weight + actions.prod(-1)
 
     score = forward
 
@@ -290,7 +290,7 @@ def test_only_modules_on_a_gpu_are_recorded(monkeypatch):
     monkeypatch.setattr(InpaintingPlanner, "device", property(lambda self: th.device("cuda")))
     module = Value()
     assert all(planner._can_be_recorded(f) for f in (None, module, module.score))
-    assert not planner._can_be_recorded(value) and not planner._can_be_recorded(lambda states, *_: states[..., 0])
+    assert not planner._can_be_recorded(value) and not planner._can_be_recorded(lambda states, actions: states[..., 0])
 
 
 @pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")

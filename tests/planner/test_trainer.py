@@ -147,7 +147,7 @@ def train_and_plan(**config):
     generator = th.Generator().manual_seed(0)
     observation, history = th.ones(4, STATE_DIM), th.zeros(4, D, ACTION_DIM)
 
-    def value(states, actions, _):  # (..., obs_dim), (..., act_dim) -> (...)
+    def value(states, actions):  # (..., obs_dim), (..., act_dim) -> (...)
         return (20 * states).sin().sum(-1) + actions.sum(-1)
 
     plan = trainer.planner.plan(observation, history, th.arange(4), value_fn=value, generator=generator)

@@ -27,7 +27,7 @@ def make_source(episodes):
     states = th.arange(float(n))[:, None, None]
     order = th.randperm(n, generator=th.Generator().manual_seed(n))
     starts = (order, th.zeros(n, dtype=th.int64), remaining[order], number[order], th.zeros(n))
-    return WindowSource(states, 0.5 * states, rewards[:, None], terminated[:, None], *starts, ages=order % 3)
+    return WindowSource(states, 0.5 * states, rewards[:, None], terminated[:, None], *starts)
 
 
 def naive_returns(episodes, gamma, penalty, value_fn):
@@ -40,7 +40,7 @@ def naive_returns(episodes, gamma, penalty, value_fn):
         else:
             lacking = max(horizon - len(rewards), 0)
             mean = (sum(rewards) + lacking * np.mean(going_on)) / (len(rewards) + lacking)
-            tail = mean * horizon if value_fn is None else 1.5 * (index - 1) + (index - 1) % 3
+            tail = mean * horizon if value_fn is None else 1.5 * (index - 1)
         for t in range(len(rewards)):
             value, factor = 0.0, 1.0
             for reward in rewards[t:-1]:
@@ -49,8 +49,8 @@ def naive_returns(episodes, gamma, penalty, value_fn):
     return returns
 
 
-def critic(states, actions, ages):
-    return states[:, 0] + actions[:, 0] + ages
+def critic(states, actions):
+    return states[:, 0] + actions[:, 0]
 
 
 @settings(max_examples=80, deadline=None)
@@ -65,7 +65,7 @@ def test_returns_against_a_walk_through_episodes(episodes, gamma, penalty, value
 
 def test_returns_by_hand():
     source = make_source([([1.0, 2.0], True), ([4.0, 8.0], False)])
-    twenty = lambda states, *_: th.full((len(states),), 20.0)  # noqa: E731  # of the last step and all after it
+    twenty = lambda states, actions: th.full((len(states),), 20.0)  # noqa: E731  # of the last step and all after it
     returns = returns_to_go(source, 0.5, value_fn=twenty)
     assert returns[source.rows.argsort()].tolist() == [1 + 0.5 * 2, 2, 4 + 0.5 * 20, 20]
 
@@ -92,7 +92,7 @@ def test_no_discount_needs_a_value_function():
     source = make_source([([1.0, 1.0], False)])
     with pytest.raises(ValueError, match="gamma < 1"):
         returns_to_go(source, 1.0)
-    assert sorted(returns_to_go(source, 1.0, value_fn=lambda s, *_: th.full((len(s),), 7.0)).tolist()) == [7.0, 8.0]
+    assert sorted(returns_to_go(source, 1.0, value_fn=lambda s, a: th.full((len(s),), 7.0)).tolist()) == [7.0, 8.0]
     ended = make_source([([1.0, 1.0], True), ([5.0], True)])
     assert sorted(returns_to_go(ended, 1.0).tolist()) == [1.0, 2.0, 5.0]
 

@@ -21,7 +21,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import VecNormalize
 from torch.nn import functional as F
 
-from sb3_said import SAID, DelayedObservationWrapper, DelayedSAC, StableSAC
+from sb3_said import SAID, DelayedSAC, StableSAC
 from sb3_said.delays.space import UNDELAYED
 from sb3_said.files.archive import SavedFileError
 from sb3_said.planner.plain import ZScored
@@ -150,48 +150,22 @@ def test_values_are_in_the_units_of_rewards(task, reward):
         env.env = with_rewards(reward)
     model = make(env, cls=SAID, **QUICK).learn(190)
     batch = model.replay_buffer.sample(200)
-    states, ages = batch.observations, th.zeros(200)
-    if task == "delayed":
-        states, ages = states[UNDELAYED], states["delay"][:, 0]
+    states = batch.observations[UNDELAYED] if task == "delayed" else batch.observations
     with th.no_grad():
         held = th.cat(model.critic(batch.observations, batch.actions), dim=1)
-        values = model.policy.q_value(states, batch.actions, ages)
+        values = model.policy.q_value(states, batch.actions)
     np.testing.assert_allclose(values, reward / (1 - 0.7), rtol=0.1)
     assert held.max() < 10  # the largest return of an episode is 5
-    assert model._stored_values(states, batch.actions, ages).shape == values.shape
-
-
-@pytest.mark.parametrize("reads", [True, False])
-def test_critics_know_who_goes_on(reads):
-    """Where an episode's age decides what it pays, an action's value is of that age, or else a mean over all."""
-
-    class PaysByAge(gym.Wrapper):
-        def step(self, action):
-            obs, _, *rest = self.env.step(action)
-            return obs, 1.0 + float(obs["delay"][0]), *rest
-
-    env = DelayedObservationWrapper(Drift(length=40), delay=(0, 2))  # another one in every episode
-    model = make(PaysByAge(env), cls=SAID, critic_reads_age=reads, relabelled_ages=0.0, **QUICK).learn(400)
-    batch = model.replay_buffer.sample(300)
-    held = batch.observations, batch.actions
-    with th.no_grad():
-        young, old = (
-            model.policy.q_value(held[0][UNDELAYED], held[1], th.full((300,), age)).mean() for age in (0.0, 2.0)
-        )
-    if reads:
-        np.testing.assert_allclose([young, old], [1 / (1 - 0.7), 3 / (1 - 0.7)], rtol=0.2)
-    else:
-        assert young == old
+    assert model._stored_values(states, batch.actions).shape == values.shape
 
 
 def test_what_actor_and_critics_read_of_states():
-    model = make(delayed(3), critic_reads_age=True).learn(60)
+    model = make(delayed(3)).learn(60)
     normalizer, batch = model.policy.state_normalizer, model.replay_buffer.sample(8).observations
     actor, critic = model.actor.features_extractor(batch), model.critic.features_extractor(batch)
     assert normalizer.fitted_at > 50
     th.testing.assert_close(actor[:, :2], (batch["observation"] - normalizer.mean) / normalizer.deviation)
-    th.testing.assert_close(critic[:, :2], (batch[UNDELAYED] - normalizer.mean) / normalizer.deviation)
-    th.testing.assert_close(critic[:, 2:], batch["delay"] / 3)
+    th.testing.assert_close(critic, (batch[UNDELAYED] - normalizer.mean) / normalizer.deviation)
     seen = model.replay_buffer.observations[: model.replay_buffer.size()].reshape(-1, 2)
     np.testing.assert_allclose(normalizer.mean, seen.mean(0), atol=0.5 * seen.std(0).min())  # of as many, drawn
     th.testing.assert_close(actor[:, -1:], batch["delay"] / 3)  # ages and actions as they are
@@ -464,13 +438,13 @@ def test_it_learns_to_be_where_rewards_are():
 
 def test_each_hidden_layer_of_the_critics_is_normalised_before_its_activation(tmp_path):
     networks = {"net_arch": {"pi": [8], "qf": [16, 12]}}
-    learned = make(delayed(3), critic_layer_norm=True, critic_reads_age=True, policy_kwargs=networks).learn(25)
+    learned = make(delayed(3), critic_layer_norm=True, policy_kwargs=networks).learn(25)
     learned.save(tmp_path / "agent.zip")
     model = StableSAC.load(tmp_path / "agent.zip", device="cpu")
     model.replay_buffer = learned.replay_buffer
     batch = model.replay_buffer.sample(9)
     z = model.policy.state_normalizer(batch.observations[UNDELAYED])
-    x = th.cat([z, batch.observations["delay"] / 3, batch.actions], dim=1)  # (B, obs_dim + 1 + act_dim)
+    x = th.cat([z, batch.actions], dim=1)  # (B, obs_dim + act_dim)
     for network, values in zip(model.critic.q_networks, model.critic(batch.observations, batch.actions), strict=True):
         hidden, weights = x, [*network.parameters()]
         for k in (0, 4):  # weight, bias, gain, offset of a hidden layer
@@ -526,7 +500,7 @@ def test_beside_vec_normalize():
     env = VecNormalize(make_vec_env(lambda: with_rewards(7.0), 2), gamma=0.7)
     model = make(env, cls=SAID, **QUICK).learn(260)
     batch = model.replay_buffer.sample(100, env=env)
-    values = model._stored_values(batch.observations, batch.actions, th.zeros(100))  # in the task's own rewards
+    values = model._stored_values(batch.observations, batch.actions)  # in the task's own rewards
     np.testing.assert_allclose(values, 7 / (1 - 0.7), rtol=0.15)
 
 
@@ -581,12 +555,7 @@ def test_the_actor_of_an_agent_without_average_answers_for_one_that_has_it(cls, 
 
 @pytest.mark.parametrize(
     ("name", "saved", "asked"),
-    [
-        ("actor_averaging", 0.9998, 0.0),
-        ("scale_rewards", True, False),
-        ("critic_reads_age", False, True),
-        ("critic_layer_norm", False, True),
-    ],
+    [("actor_averaging", 0.9998, 0.0), ("scale_rewards", True, False), ("critic_layer_norm", False, True)],
 )
 def test_a_load_with_other_networks_names_what_the_file_has(tmp_path, name, saved, asked):
     make().save(tmp_path / "stable.zip")

@@ -67,7 +67,7 @@ def test_the_planner_answers_after_learning_from_logs(learned, tmp_path):
     np.testing.assert_array_equal(answer(loaded, obs), answer(learned, obs))
     states = th.randn(5, 2)
     with th.no_grad():
-        assert th.equal(loaded.policy.value(states, None, None), learned.policy.value(states, None, None))
+        assert th.equal(loaded.policy.value(states, None), learned.policy.value(states, None))
     assert loaded.value == "iql"
 
 
@@ -307,7 +307,7 @@ def test_v_is_learned_online_too_and_returns_to_go_have_the_critics_values_at_cu
     fresh = model._make_value_trainer().values.v[0].weight
     assert model.policy.values is not None and not th.equal(model.policy.values.v[0].weight, fresh)
     asked = []
-    monkeypatch.setattr(model, "_stored_values", lambda states, *_: asked.append(states) or th.zeros(len(states)))
+    monkeypatch.setattr(model, "_stored_values", lambda states, _: asked.append(states) or th.zeros(len(states)))
     model.make_planner_trainer()
     source = model.replay_buffer.window_source(model.newest_fraction, None)
     ends = source.start_states()[(source.remaining == 1) & ~source.terminated[source.rows, source.envs]]

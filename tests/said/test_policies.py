@@ -19,22 +19,13 @@ from sb3_said.delays import UniformDelay
 from sb3_said.said.policies import SAIDPolicy
 
 
-@pytest.fixture(scope="module")
-def aged():
-    """A trained agent whose critics read the age; tests must leave it as it is."""
-    return make(critic_reads_age=True).learn(40)
-
-
-def test_value_is_the_smallest_critic(aged):
-    policy = aged.policy
+def test_value_is_the_smallest_critic(trained):
+    policy = trained.policy
     states, actions = th.randn(3, 4, 5, 2), th.rand(3, 4, 5, 1) * 2 - 1
-    ages = th.tensor([0, 1, 2])
-    seen = {"undelayed_observation": states.reshape(-1, 2), "delay": ages.repeat_interleave(20)[:, None].float()}
-    critics = policy.critic(seen, actions.reshape(-1, 1))
+    critics = policy.critic({"undelayed_observation": states.reshape(-1, 2)}, actions.reshape(-1, 1))
     expected = th.minimum(*critics).reshape(3, 4, 5) * policy.return_scale.value  # in units of rewards
     assert not th.equal(critics[0], critics[1])
-    th.testing.assert_close(policy.value(states, actions, ages), expected)
-    assert not th.allclose(policy.value(states, actions, 0 * ages)[1:], expected[1:])
+    th.testing.assert_close(policy.value(states, actions), expected)
 
 
 class ReadingBack(TorchDispatchMode):
@@ -46,10 +37,10 @@ class ReadingBack(TorchDispatchMode):
 
 
 def test_no_number_is_read_back_where_candidates_are_scored(trained):
-    given = th.randn(3, 4, 5, 2), th.rand(3, 4, 5, 1) * 2 - 1, th.arange(3)
+    states, actions = th.randn(3, 4, 5, 2), th.rand(3, 4, 5, 1) * 2 - 1
     with ReadingBack():
-        values = trained.policy.value(*given)
-    assert th.equal(values, trained.policy.value(*given)) and trained.policy.return_scale.value != 1
+        values = trained.policy.value(states, actions)
+    assert th.equal(values, trained.policy.value(states, actions)) and trained.policy.return_scale.value != 1
     with pytest.raises(AssertionError, match="read back"), ReadingBack():
         float(values.detach()[0, 0, 0])
 
@@ -71,17 +62,17 @@ def test_values_are_those_of_critics_in_use(layer):
     extractor = {"features_extractor_class": Scaled, "features_extractor_kwargs": {"layer": layer}}
     model = make(Drift(length=1000), policy_kwargs={"net_arch": [32], **extractor}).learn(25)
     assert model.policy.planner_is_trained
-    states, actions, ages = th.randn(3, 4, 2), th.zeros(3, 4, 1), th.zeros(3)
+    states, actions = th.randn(3, 4, 2), th.zeros(3, 4, 1)
     model.policy.set_training_mode(True)
-    batch = model.policy.value(states, actions, ages)
+    batch = model.policy.value(states, actions)
     model.policy.set_training_mode(True)
-    rows = [model.policy.value(states[i : i + 1, :1], actions[i : i + 1, :1], ages[:1])[0] for i in range(3)]
+    rows = [model.policy.value(states[i : i + 1, :1], actions[i : i + 1, :1])[0] for i in range(3)]
     th.testing.assert_close(batch[:, :1], th.stack(rows))
 
 
 @pytest.mark.parametrize("delay", [0, 1, 2])
-def test_the_candidate_of_the_highest_value_after_the_decision_answers(aged, delay):
-    policy, planner = aged.policy, aged.policy.planner
+def test_the_candidate_of_the_highest_value_after_the_decision_answers(trained, delay):
+    policy, planner = trained.policy, trained.policy.planner
     obs = rows_of(observe())[delay]  # ages grow from 0 at an episode's start
     assert obs["delay"] == delay
     batch = {key: th.as_tensor(value[None]) for key, value in obs.items()}
@@ -91,19 +82,20 @@ def test_the_candidate_of_the_highest_value_after_the_decision_answers(aged, del
     )
     assert plan.values.shape == (1, 4) and len(plan.values.unique()) > 1
     futures = plan.states[0, :, delay + 1 :], plan.actions[0, :, delay + 1 :]
-
-    def seen(states):
-        return {"undelayed_observation": states, "delay": th.full((len(states), 1), float(delay))}
-
     scores = (
         th.minimum(
-            *(th.stack([policy.critic(seen(s), a)[i][:, 0] for s, a in zip(*futures, strict=True)]) for i in (0, 1))
+            *(
+                th.stack(
+                    [policy.critic({"undelayed_observation": s}, a)[i][:, 0] for s, a in zip(*futures, strict=True)]
+                )
+                for i in (0, 1)
+            )
         ).mean(1)
         * policy.return_scale.value
     )
     th.testing.assert_close(plan.values[0], scores)
     chosen = plan.actions[0, scores.argmax(), delay].numpy()
-    np.testing.assert_allclose(answer(aged, obs), 2.0 * chosen, rtol=1e-6, atol=1e-6)  # actions run from -2 to 2
+    np.testing.assert_allclose(answer(trained, obs), 2.0 * chosen, rtol=1e-6, atol=1e-6)  # actions run from -2 to 2
 
 
 def test_at_temperature_0_nothing_is_drawn_and_no_critic_asked(saved, monkeypatch):

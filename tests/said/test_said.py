@@ -513,10 +513,10 @@ def test_normalized_tasks(env):
     scaled = np.clip((states - rms.mean) / np.sqrt(rms.var + vec_env.epsilon), -10, 10)
     source = model.make_planner_trainer().source
     np.testing.assert_allclose(source.states[: buffer.size()], scaled, rtol=1e-4, atol=1e-6)
-    given = source.states[: buffer.size(), 0], source.actions[: buffer.size(), 0], th.zeros(buffer.size())
-    values = model._stored_values(*given)
+    pairs = source.states[: buffer.size(), 0], source.actions[: buffer.size(), 0]
+    values = model._stored_values(*pairs)
     with th.no_grad():
-        critic = model.policy.value(*given)
+        critic = model.policy.value(*pairs)
     np.testing.assert_allclose(values, critic * np.sqrt(vec_env.ret_rms.var + vec_env.epsilon), rtol=1e-4, atol=1e-5)
 
 
@@ -565,7 +565,7 @@ def test_windows_weigh_what_rewards_and_critics_add_up_to():
     source = trainer.source
     states, actions = (th.from_numpy(part[:36, 0]) for part in (buffer.observations, buffer.actions))
     with th.no_grad():
-        bootstrapped = model.policy.q_value(states, actions, th.from_numpy(buffer.ages[:36, 0])).numpy()
+        bootstrapped = model.policy.q_value(states, actions).numpy()
     expected = np.zeros(36)
     for k in reversed(range(36)):
         expected[k] = bootstrapped[k] if k % 12 == 11 else 1.0 + 0.9 * expected[k + 1]
