@@ -1,4 +1,4 @@
-"""Training a planner: gradient steps, averaged weights, held-out errors, and resuming bit for bit."""
+"""Training a planner: gradient steps, averaged weights, and resuming bit for bit."""
 
 from __future__ import annotations
 
@@ -10,19 +10,18 @@ from dataclasses import replace
 from typing import Any
 
 import torch as th
-import torch.nn.functional as F
 
 from sb3_said.planner.checks import check_same
 from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.first_guess import GUESS_BATCH_SIZE, fit_first_guess
 from sb3_said.planner.graphs import Recording
+from sb3_said.planner.held_out import draw_held_out, held_out_errors
 from sb3_said.planner.inpainting import draw_delays
 from sb3_said.planner.planner import InpaintingPlanner
 from sb3_said.planner.values import scaled_values, window_weight
 from sb3_said.planner.yardstick import RegressionYardstick
-from sb3_said.replay.windows import Windows, WindowSource
+from sb3_said.replay.windows import WindowSource
 
-HELD_OUT_WINDOWS = 1024  # per delay, in evaluate(): enough to tell errors apart that differ by 2 %
 YARDSTICK_LEARNING_RATE = 1e-3
 N_NORMALIZER_WINDOWS = 10_000  # enough for a standard deviation to a percent
 N_PRIOR_WINDOWS = 1_000  # each is guessed at every age
@@ -49,20 +48,6 @@ def ema_decay(step: int, config: PlannerConfig) -> float:
     if not config.ema_warmup:
         return config.ema_decay
     return min(config.ema_decay, (1 + step) / (10 + step))
-
-
-def worse_than_regression(errors: dict[str, float], tolerance: float = 0.05) -> str:
-    """Name the errors that lie above those of the regression, such as ``"present_error_d4 0.31 against 0.20"``.
-
-    :param errors: of :meth:`PlannerTrainer.evaluate`
-    :param tolerance: part by which an error may lie above, for windows are few
-    """
-    bars = {name.replace("_mlp", ""): bar for name, bar in errors.items() if "_mlp" in name}
-    return ", ".join(
-        f"{name.removeprefix('planner/')} {errors[name]:.3g} against {bar:.3g}"
-        for name, bar in bars.items()
-        if errors[name] > (1 + tolerance) * bar
-    )
 
 
 @contextmanager
@@ -165,7 +150,9 @@ class PlannerTrainer:
         self._n_losses = 0
         self._bad_update = th.full((), -1, device=self.device)
         self._recorded = Recording(self.device, self.generator) if on_gpu else None
-        self._held_out = {} if held_source is None else self._draw_held_out(held_source, seed)
+        self._held_out = {}
+        if held_source is not None:
+            self._held_out = draw_held_out(held_source, self.average, seed, self._is_own)
 
     def step(self) -> None:
         """Make one update.
@@ -302,29 +289,13 @@ class PlannerTrainer:
         rate = float(self.optimizer.param_groups[0]["lr"])
         return {"planner/loss": loss, "planner/loss_mlp": yardstick_loss, "planner/learning_rate": rate}
 
-    @th.no_grad()
     def evaluate(self) -> dict[str, float]:
-        """Return mean absolute errors on held-out windows, for every delay d that is trained and that some show.
+        """Return the errors of the averaged weights on held-out windows, as of :func:`held_out_errors`.
 
-        ``planner/present_error_d4`` is the error of the decoded s_t at delay 4, in standard deviations of the states;
-        ``planner/action_error_d4`` that of the decision a_t, in [-1, 1]; ``..._mlp_d4`` are the
-        regression's. The planner decodes with its averaged weights, one candidate and temperature 0.
+        :raises FloatingPointError: when an update was not finite
         """
         self._check_finite()
-        metrics, normalize = {}, self.average.normalizer.normalize_states
-        for d, windows in self._held_out.items():
-            states, actions = windows.states, windows.actions
-            delay = th.full((len(states),), d, device=self.device)
-            history = F.pad(actions[:, :d], (0, 0, self.average.max_delay - d, 0))  # (B, D, act_dim), as an agent has
-            plan = self.average.plan(states[:, 0], history, delay, temperature=0.0)
-            present, decision = self.yardstick(normalize(states[:, 0]), actions, delay)
-            for name, state, action in (
-                ("", normalize(plan.present), plan.action),
-                ("_mlp", present, decision.clamp(-1.0, 1.0)),
-            ):
-                metrics[f"planner/present_error{name}_d{d}"] = (state - normalize(states[:, d])).abs().mean().item()
-                metrics[f"planner/action_error{name}_d{d}"] = (action - actions[:, d]).abs().mean().item()
-        return metrics
+        return held_out_errors(self.average, self.yardstick, self._held_out)
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything a resumed training needs: nested dicts of numbers, strings, lists and tensors (copies)."""
@@ -386,19 +357,6 @@ class PlannerTrainer:
                 "Check the data for infinite values; else lower learning_rate "
                 f"({self.config.learning_rate}) or lengthen warmup_steps ({self.config.warmup_steps})."
             )
-
-    def _draw_held_out(self, source: WindowSource, seed: int) -> dict[int, Windows]:
-        """Return windows of every delay that the planner is trained for; a delay longer than all episodes has none."""
-        D, generator = self.average.max_delay, th.Generator().manual_seed(seed)
-        held_out = {}
-        for d in [D] if self.config.mask == "fixed" else range(D + 1):
-            long_enough = th.nonzero(source.remaining > d)[:, 0]  # index d, the decision, is in the same episode
-            if self._is_own and len(own := source.own_starts(d)):
-                long_enough = own
-            starts = long_enough[th.randperm(len(long_enough), generator=generator)[:HELD_OUT_WINDOWS]]
-            if len(starts):
-                held_out[d] = source.gather(starts, self.average.window_length).to(self.device)
-        return held_out
 
 
 def _is_finite(tree: Any) -> bool:

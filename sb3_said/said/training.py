@@ -17,7 +17,8 @@ from sb3_said.files.evaluations import evaluations_of, restore_evaluations
 from sb3_said.offline.iql import IQL
 from sb3_said.planner.checks import check_same
 from sb3_said.planner.config import PlannerConfig
-from sb3_said.planner.trainer import PlannerTrainer, worse_than_regression
+from sb3_said.planner.held_out import worse_than_regression
+from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.said.agent import PlannerAgent
 
 PLANNER_CHECKPOINT_NAME = "planner_checkpoint.zip"

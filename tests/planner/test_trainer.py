@@ -21,7 +21,6 @@ from sb3_said.planner.trainer import (
     PlannerTrainer,
     ema_decay,
     learning_rate,
-    worse_than_regression,
 )
 from sb3_said.planner.values import VALUE_SCALES, scaled_values
 
@@ -449,28 +448,6 @@ def test_evaluation_covers_every_delay(max_delay, mask, delays):
         assert metrics["planner/present_error_d0"] < 1e-5  # nothing is hidden there
 
 
-def test_errors_are_of_the_present_and_of_the_action_at_the_decision():
-    trainer = make_trainer()
-    trainer.train(5)
-    trainer.yardstick.requires_grad_(False)
-    metrics, normalizer = trainer.evaluate(), trainer.average.normalizer
-    for d, (states, actions, _, _) in trainer._held_out.items():
-        history = th.zeros(len(states), D, ACTION_DIM)
-        history[:, D - d :] = actions[:, :d]
-        delay = th.full((len(states),), d)
-        plan = trainer.average.plan(states[:, 0], history, delay, temperature=0.0)
-        present, decision = trainer.yardstick(normalizer.normalize_states(states[:, 0]), actions, delay)
-        off = normalizer.normalize_states(plan.present) - normalizer.normalize_states(states[:, d])
-        yardstick_off = present - normalizer.normalize_states(states[:, d])
-        for name, error in (
-            ("present_error", off),
-            ("action_error", plan.action - actions[:, d]),
-            ("present_error_mlp", yardstick_off),
-            ("action_error_mlp", decision.clamp(-1, 1) - actions[:, d]),
-        ):
-            assert metrics[f"planner/{name}_d{d}"] == pytest.approx(error.abs().mean().item(), rel=1e-5)
-
-
 def test_the_regression_meets_every_age_also_where_the_planner_meets_none(monkeypatch):
     trainer, met = make_trainer(mask="none", first_guess="prior"), []
     loss = trainer.yardstick.loss
@@ -481,14 +458,6 @@ def test_the_regression_meets_every_age_also_where_the_planner_meets_none(monkey
     )
     trainer.train(3)
     assert set(met) == set(range(D + 1))
-
-
-def test_evaluation_s_windows_reach_the_decision():
-    trainer = make_trainer(source=make_source(40, 5), max_delay=3)
-    assert list(trainer._held_out) == [0, 1, 2, 3]
-    assert all(windows.valid[:, d].all() for d, windows in trainer._held_out.items())
-    # In an episode of five steps no decision comes five or six steps after an observation.
-    assert list(make_trainer(source=make_source(40, 5), max_delay=6)._held_out) == [0, 1, 2, 3, 4]
 
 
 def test_global_generator_is_neither_read_nor_moved():
@@ -523,23 +492,6 @@ def test_callback_can_stop():
     assert trainer.n_updates == 3
 
 
-def test_evaluation_sees_no_future_action():
-    """Errors are those of an agent: whatever is unknown at the decision may be anything."""
-    trainer = make_trainer()
-    with pytest.MonkeyPatch.context() as patch:
-        given, plan = [], trainer.average.plan
-        patch.setattr(trainer.average, "plan", lambda *batch, **rest: given.append(batch[1]) or plan(*batch, **rest))
-        trainer.evaluate()
-    for (d, windows), history in zip(trainer._held_out.items(), given, strict=True):
-        delay = th.full((len(windows.states),), d)
-        np.testing.assert_array_equal(history[:, D - d :], windows.actions[:, :d])
-        np.testing.assert_array_equal(history[:, : D - d], 0.0)
-        guess = trainer.yardstick(windows.states[:, 0], windows.actions, delay)
-        others = windows.actions.clone()
-        others[:, d:] = 7.0
-        assert_same(list(guess), list(trainer.yardstick(windows.states[:, 0], others, delay)))
-
-
 def test_no_held_out_data():
     trainer = make_trainer(held_out=0.0)
     trainer.train(2)
@@ -550,18 +502,6 @@ def test_delay_zero_planner_trains():
     trainer = make_trainer(max_delay=0)
     trainer.train()
     assert trainer.evaluate()["planner/action_error_d0"] > 0
-
-
-def test_what_a_planner_is_worse_at_is_named():
-    errors = {"planner/present_error_d0": 0.0, "planner/present_error_d4": 0.31, "planner/action_error_d4": 0.204}
-    bars = {
-        "planner/present_error_mlp_d0": 0.0,
-        "planner/present_error_mlp_d4": 0.2,
-        "planner/action_error_mlp_d4": 0.2,
-    }
-    assert worse_than_regression(errors | bars) == "present_error_d4 0.31 against 0.2"
-    assert worse_than_regression(errors | bars, tolerance=0.0).endswith(", action_error_d4 0.204 against 0.2")
-    assert worse_than_regression({}) == ""
 
 
 def test_infinite_loss_names_its_update(monkeypatch):
