@@ -21,14 +21,13 @@ from typing import Any
 import numpy as np
 import torch as th
 from measure import print_table, progress, resumed
-from what_diffusion_buys import agent_of, make_env, open_run, open_with_log
+from what_diffusion_buys import agent_of, make_env, opened
 
 from sb3_said import SAID
 from sb3_said.evaluation import collect_observations, confidence_interval, measure_latency, rollout
 from sb3_said.files.atomic import write_json
 from sb3_said.realtime import OnnxModel
 from sb3_said.said.export import export
-from sb3_said.zoo.arguments import explained
 
 
 def play(model: SAID, args: argparse.Namespace) -> dict[str, Any]:
@@ -65,8 +64,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     p.add_argument("--json", type=Path, required=True, help="file of the numbers, read and written")
     args = p.parse_args(argv)
     th.set_num_threads(args.num_threads)
-    with explained(p):
-        model = open_run(args.run) if args.log is None else open_with_log(args.run, args.log)
+    model = opened(p, args.run, args.log)
     model.set_planner(temperature=0.0)
     settings = {name: getattr(args, name) for name in ("settings", "delays", "episodes", "eval_seed")}
     settings |= agent_of(model, args)

@@ -25,6 +25,7 @@ from measure import print_table
 
 from sb3_said.evaluation import plots
 from sb3_said.offline import normalized_score
+from sb3_said.zoo.arguments import explained
 
 DELAYS = (0, 4, 8, 16)
 NAMES = {
@@ -115,10 +116,8 @@ def main(argv: list[str] | None = None) -> dict[tuple[str, str], dict[str, Seeds
         if not path:
             p.error(f"{word} is no SET=JSON, such as medium=hopper-medium-0.json.")
         files.append((kind, name or None, Path(path)))
-    try:
+    with explained(p):
         found = table(files)
-    except ValueError as error:
-        p.error(str(error))
     show(found)
     for (kind, env), rows in found.items() if args.plot else ():
         returns: dict[str, Any] = {

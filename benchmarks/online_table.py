@@ -29,6 +29,7 @@ import numpy as np
 from measure import print_table
 
 from sb3_said.evaluation import Interval, confidence_interval, plots, stratified_interval
+from sb3_said.zoo.arguments import explained
 from sb3_said.zoo.cells import Cell, Results
 from sb3_said.zoo.tables import manners_of
 
@@ -171,10 +172,8 @@ def main(argv: list[str] | None = None) -> dict[str, dict[str, Seeds]]:
     args = p.parse_args(argv)
     if not [*args.files, *args.expert_answers]:
         p.error("Expected files of sb3-said over-delays, got none.")
-    try:
+    with explained(p):
         found = read(args.files, args.expert_answers)
-    except ValueError as error:
-        p.error(str(error))
     show(each_by_itself(found) if args.each else found)
     if args.plot:
         plot(found, args.plot)

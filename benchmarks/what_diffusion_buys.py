@@ -168,6 +168,15 @@ def open_with_log(agent: Path, log: Path, device: str = "cpu") -> SAID:
     return run.model
 
 
+def opened(p: argparse.ArgumentParser, run: Path, log: Path | None, device: str = "cpu") -> SAID:
+    """Return a run's agent with its replay, or an agent with a log; the program ends where there is none.
+
+    :param p: reports the error
+    """
+    with explained(p):
+        return open_run(run, device) if log is None else open_with_log(run, log, device)
+
+
 def agent_of(model: SAID, args: argparse.Namespace) -> dict[str, Any]:
     """Return what tells an agent and its data from others, in JSON types."""
     weights = [x.numpy(force=True).tobytes() for x in model.actor.state_dict().values()]
@@ -283,9 +292,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     p.add_argument("--json", type=Path, required=True, help="file of the numbers, read and written")
     args = p.parse_args(argv)
     th.set_num_threads(args.num_threads)
-    with explained(p):
-        is_run = args.log is None
-        model = open_run(args.run, args.device) if is_run else open_with_log(args.run, args.log, args.device)
+    model = opened(p, args.run, args.log, args.device)
     preset = preset_of(model, args)
     if preset.first_guess == "none" and {"guessed present", GUESS_ALONE} & {*args.rows}:
         p.error(f"This planner has no first guess: leave 'guessed present' and {GUESS_ALONE!r} out of --rows.")

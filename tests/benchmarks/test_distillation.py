@@ -10,7 +10,7 @@ pytest.importorskip("onnxruntime")
 
 import distillation as script
 from small_run import write_run
-from what_diffusion_buys import open_run
+from what_diffusion_buys import open_run, open_with_log
 
 from sb3_said import SAID, DelayedSAC
 from sb3_said.evaluation import rollout
@@ -58,10 +58,10 @@ def test_a_log_takes_the_replays_place(run: Path, tmp_path: Path) -> None:
     words = [str(run), "--log", str(log), "--settings", json.dumps(TINY), "--delays", "0", "2", "--episodes", "1"]
     rows = script.main([*words, "--calls", "1", "--json", str(file)])
 
-    model = script.open_with_log(run, log)
+    model = open_with_log(run, log)
     assert model.replay_buffer.size() == 70
     model.seed = 1
     assert model.distill(**TINY) == rows["student, seed 1"]["error"]
     write_run(tmp_path / "expert-v0", DelayedSAC, 2)
     with pytest.raises(ValueError, match="DelayedSAC; give a SAID agent"):
-        script.open_with_log(tmp_path / "expert-v0", log)
+        open_with_log(tmp_path / "expert-v0", log)

@@ -43,23 +43,26 @@ def test_each_run_of_a_file_has_a_row_with_its_evaluations(tmp_path: Path, capsy
     ]
 
 
-def test_a_name_that_a_file_lacks_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = tmp_path / "runs.json"
-    file.write_text('[{"name": "stable", "run": "a", "steps": [1], "returns": [[1.0]]}]')
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (
+            '[{"name": "stable", "run": "a", "steps": [1], "returns": [[1.0]]}]',
+            "has no runs named 'stabel', only stable",
+        ),
+        ('{"agents": {}}', "was not written by --json of this program"),
+    ],
+)
+def test_a_file_without_the_runs_is_told(
+    content: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (file := tmp_path / "runs.json").write_text(content)
     with pytest.raises(SystemExit):
         steadiness.main([f"stabel={file}"])
-    assert "has no runs named 'stabel', only stable" in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 def test_a_run_without_evaluations_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         steadiness.main([f"x={tmp_path}"])
     assert "train with --eval-freq" in capsys.readouterr().err
-
-
-def test_a_file_of_another_program_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = tmp_path / "hopper.json"
-    file.write_text('{"agents": {}}')
-    with pytest.raises(SystemExit):
-        steadiness.main([f"x={file}"])
-    assert "was not written by --json of this program" in capsys.readouterr().err

@@ -99,8 +99,10 @@ def test_selection_by_value_approaches_the_best_plan(trainer):
     def lqr(observation, history, delay):
         return -present(observation, history, delay) @ K.T
 
+    def value(states, actions):
+        return -(states @ P * states).sum(-1)
+
     def planned(observation, history, delay):
-        value = lambda states, actions: -(states @ P * states).sum(-1)  # noqa: E731
         plan = trainer.planner.plan(
             observation, history, delay, value_fn=value, n_candidates=16, temperature=1.0, generator=generator
         )

@@ -15,6 +15,7 @@ from linear_system import ACTION_DIM, STATE_DIM, make_source
 from sb3_said.planner import InpaintingPlanner, PlannerConfig
 from sb3_said.planner.diffusion import alpha_sigma, draw_times
 from sb3_said.planner.dit import HEAD_DIM
+from sb3_said.planner.held_out import held_out_errors
 from sb3_said.planner.inpainting import draw_delays
 from sb3_said.planner.trainer import (
     YARDSTICK_LEARNING_RATE,
@@ -458,6 +459,14 @@ def test_the_regression_meets_every_age_also_where_the_planner_meets_none(monkey
     )
     trainer.train(3)
     assert set(met) == set(range(D + 1))
+
+
+def test_errors_are_those_of_the_averaged_weights():
+    trainer = make_trainer()
+    trainer.train(5)
+    errors = trainer.evaluate()
+    assert errors == held_out_errors(trainer.average, trainer.yardstick, trainer._held_out)
+    assert errors != held_out_errors(trainer.online, trainer.yardstick, trainer._held_out)
 
 
 def test_global_generator_is_neither_read_nor_moved():

@@ -65,7 +65,10 @@ def test_returns_against_a_walk_through_episodes(episodes, gamma, penalty, value
 
 def test_returns_by_hand():
     source = make_source([([1.0, 2.0], True), ([4.0, 8.0], False)])
-    twenty = lambda states, actions: th.full((len(states),), 20.0)  # noqa: E731  # of the last step and all after it
+
+    def twenty(states, actions):  # of the last step and all after it
+        return th.full((len(states),), 20.0)
+
     returns = returns_to_go(source, 0.5, value_fn=twenty)
     assert returns[source.rows.argsort()].tolist() == [1 + 0.5 * 2, 2, 4 + 0.5 * 20, 20]
 
