@@ -14,7 +14,7 @@ settings.load_profile("suite")
 
 
 # Their agents are loaded by processes of the package's own, or come from files; or they ask how well it is learned
-OF_THE_USUAL_SIZE = {"test_over_delays", "test_shipped_agents", "test_belief"}
+OF_THE_USUAL_SIZE = {"test_over_delays", "test_playing", "test_shipped_agents", "test_belief"}
 
 
 @pytest.fixture(scope="module", autouse=True)
