@@ -13,7 +13,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_said.offline.datasets import Dataset
-from sb3_said.planner.checks import check_same, check_settings
+from sb3_said.planner.checks import check_same, check_settings, check_stored
 from sb3_said.planner.plain import ZScored
 
 SMALLEST_SPREAD = 0.1  # of returns, as a part of the largest: nearly equal returns would be scaled up without bound
@@ -149,8 +149,20 @@ class IQL:
         polyak_update(self.values.q.parameters(), self.values.q_target.parameters(), self.values.config.target_rate)
         return losses
 
+    def check_finite(self) -> None:
+        """:raises FloatingPointError: where the values have learned NaN or infinite weights"""
+        if not nn.utils.get_total_norm(self.values.parameters()).isfinite():
+            raise FloatingPointError(
+                "The weights of V(s) are no longer finite. Check the data for huge rewards; else lower learning_rate "
+                f"of iql_kwargs ({self.values.config.learning_rate})."
+            )
+
     def state_dict(self) -> dict[str, Any]:
-        """Return all that a resumed training needs, but the data."""
+        """Return all that a resumed training needs, but the data.
+
+        :raises FloatingPointError: as :meth:`check_finite`
+        """
+        self.check_finite()
         return {
             "config": asdict(self.values.config),
             "values": self.values.state_dict(),
@@ -161,8 +173,9 @@ class IQL:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Resume from what :meth:`state_dict` returned.
 
-        :raises ValueError: when the saved training had other settings
+        :raises ValueError: when the saved training had other settings, or has numbers that are not finite
         """
+        check_stored(state)
         advice = "Give the old iql_kwargs, or start a new training."
         check_same("V(s) was learned", state["config"], asdict(self.values.config), advice)
         self.values.load_state_dict(state["values"])

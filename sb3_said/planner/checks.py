@@ -107,6 +107,20 @@ def finite_tensor(name: str, values: th.Tensor, shape: tuple[int | None, ...], d
     return values
 
 
+def check_stored(state: dict[str, Any]) -> None:
+    """:raises ValueError: where a training's stored state, nested dicts and lists, has numbers that are not finite"""
+    if not _all_finite(state):
+        raise ValueError("The stored training holds NaN or infinite numbers; start a new one.")
+
+
+def _all_finite(tree: Any) -> bool:
+    if isinstance(tree, (dict, list, tuple)):
+        return all(map(_all_finite, tree.values() if isinstance(tree, dict) else tree))
+    if isinstance(tree, th.Tensor):
+        return bool(tree.isfinite().all())
+    return not isinstance(tree, float) or math.isfinite(tree)
+
+
 def checked_delay(delay: th.Tensor, batch_size: int, max_delay: int) -> th.Tensor:
     """Return delays as (B,) int64.
 

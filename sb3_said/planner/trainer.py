@@ -11,7 +11,7 @@ from typing import Any
 
 import torch as th
 
-from sb3_said.planner.checks import check_same
+from sb3_said.planner.checks import check_same, check_stored
 from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.first_guess import GUESS_BATCH_SIZE, fit_first_guess
 from sb3_said.planner.graphs import Recording
@@ -142,7 +142,7 @@ class PlannerTrainer:
             self.yardstick.parameters(), lr=self._rate(YARDSTICK_LEARNING_RATE), **fused
         )
         self._modules = {"average": self.average, "online": self.online, "yardstick": self.yardstick}
-        self._optimizers = {"optimizer": self.optimizer, "yardstick_optimizer": self.yardstick_optimizer}
+        self.optimizers = {"optimizer": self.optimizer, "yardstick_optimizer": self.yardstick_optimizer}
         self._averaged: list[th.Tensor] = list(self.average.network.parameters())
         self._online: list[th.Tensor] = list(self.online.network.parameters())
         # Read at log times only: a read at each update would wait for the GPU each time
@@ -230,7 +230,7 @@ class PlannerTrainer:
     def _descend(self) -> tuple[th.Tensor]:
         """Draw a batch, update planner and regression, and return their losses, (2,). Never wait for the device."""
         config = self.config
-        for optimizer in self._optimizers.values():
+        for optimizer in self.optimizers.values():
             optimizer.zero_grad()
         drawn = self.average.window_length, self.generator, config.early_probability
         if self._is_own:
@@ -306,7 +306,7 @@ class PlannerTrainer:
                 "n_updates": self.n_updates,
                 **{name: dict(module.state_dict()) for name, module in self._modules.items()},
                 # No optimizer's groups: they hold nothing but settings
-                **{name: optimizer.state_dict()["state"] for name, optimizer in self._optimizers.items()},
+                **{name: optimizer.state_dict()["state"] for name, optimizer in self.optimizers.items()},
                 "generator": self.generator.get_state(),
                 "loss_sums": self._loss_sums,
                 "n_losses": self._n_losses,
@@ -320,17 +320,17 @@ class PlannerTrainer:
         """
         advice = "Resume with the settings and data that it began with, or start a new training."
         check_same("The stored training was begun", state["settings"], self._settings, advice)
-        if not _is_finite({name: value for name, value in state.items() if name != "generator"}):
-            raise ValueError("The stored training holds NaN or infinite numbers; start a new one.")
-        if type(state["n_updates"]) is not int or not 0 <= state["n_updates"] <= self.gradient_steps:
-            raise ValueError(f"The stored training made {state['n_updates']} of {self.gradient_steps} updates.")
+        check_stored(state)
+        for name in ("n_updates", "n_losses"):
+            if type(state[name]) is not int or not 0 <= state[name] <= self.gradient_steps:
+                raise ValueError(f"The stored training made {state[name]} of {self.gradient_steps} updates ({name}).")
         state = copy.deepcopy(state)
         self.n_updates = state["n_updates"]
         for name, module in self._modules.items():
             module.load_state_dict(state[name])
         prior = self.online.prior
         self._has_guess = self.n_updates > 0 or (prior is not None and prior.is_fitted)
-        for name, optimizer in self._optimizers.items():
+        for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict({**optimizer.state_dict(), "state": state[name]})
         drawn = state["generator"].cpu()
         if len(drawn) == len(self.generator.get_state()):
@@ -357,12 +357,3 @@ class PlannerTrainer:
                 "Check the data for infinite values; else lower learning_rate "
                 f"({self.config.learning_rate}) or lengthen warmup_steps ({self.config.warmup_steps})."
             )
-
-
-def _is_finite(tree: Any) -> bool:
-    """Tell whether all numbers in nested dicts and lists are finite."""
-    if isinstance(tree, (dict, list, tuple)):
-        return all(map(_is_finite, tree.values() if isinstance(tree, dict) else tree))
-    if isinstance(tree, th.Tensor):
-        return bool(tree.isfinite().all())
-    return not isinstance(tree, float) or math.isfinite(tree)

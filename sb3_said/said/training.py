@@ -13,6 +13,7 @@ from tqdm.auto import tqdm
 
 from sb3_said.files.archive import load_tree, readable
 from sb3_said.files.checkpoint import CheckpointClock, checksum
+from sb3_said.files.checks import check_optimizer_state
 from sb3_said.files.evaluations import evaluations_of, restore_evaluations
 from sb3_said.offline.iql import IQL
 from sb3_said.planner.checks import check_same
@@ -72,8 +73,11 @@ class PlannerTraining:
                 if {key: state[key] for key in self._data} == self._data:
                     advice = "Give what it began with, or another folder."
                     check_same("The planner's training was begun", state["weighed"], self._weighed, advice)
+                    for name, optimizer in trainer.optimizers.items():
+                        check_optimizer_state(name, state["trainer"][name], optimizer)
                     trainer.load_state_dict(state["trainer"])
                     if value_trainer is not None:
+                        check_optimizer_state("values", state["values"]["optimizer"], value_trainer.optimizer)
                         value_trainer.load_state_dict(state["values"])
                     restore_evaluations(watcher, state["evaluations"])
                 elif watcher is not None:  # on logs, where a folder has one training alone
@@ -132,6 +136,8 @@ class PlannerTraining:
 
         :raises FloatingPointError: when an update was not finite; all stays as it was
         """
+        if self.value_trainer is not None:
+            self.value_trainer.check_finite()
         self.trainer.hand_over()
         self.has_handed_over = self.trainer.n_updates > 0
         if self.has_handed_over and self.is_agents:

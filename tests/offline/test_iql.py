@@ -131,6 +131,9 @@ def test_a_resumed_training_ends_as_one_that_never_stopped():
     th.testing.assert_close(second.values.state_dict(), whole.values.state_dict(), rtol=0, atol=0)
     with pytest.raises(ValueError, match=r"V\(s\) was learned with .*: expectile was 0\.7 and is now 0\.9\. "):
         make(expectile=0.9).load_state_dict(saved)
+    saved["values"]["v.0.weight"][0] = th.nan
+    with pytest.raises(ValueError, match="holds NaN or infinite numbers"):
+        make().load_state_dict(saved)
 
 
 @pytest.mark.parametrize(

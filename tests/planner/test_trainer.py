@@ -399,7 +399,13 @@ def test_settings_survive_json_and_others_are_refused():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("n_updates", -1), ("n_updates", 10**9), ("n_updates", "3"), ("loss_sums", th.tensor([th.nan, 0.0]))],
+    [
+        ("n_updates", -1),
+        ("n_updates", 10**9),
+        ("n_updates", "3"),
+        ("n_losses", "3"),
+        ("loss_sums", th.tensor([th.nan, 0.0])),
+    ],
 )
 def test_a_stored_training_that_none_can_be_is_refused(name, value):
     trainer = make_trainer()

@@ -14,7 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_said import SAID, PlannerConfig, StableSAC
-from sb3_said.files.archive import SavedFileError
+from sb3_said.files.archive import SavedFileError, load_tree, save_tree
 from sb3_said.offline import IQL, Dataset, IQLConfig, load_dataset
 from sb3_said.planner.trainer import PlannerTrainer
 from sb3_said.said.policies import SAIDPolicy
@@ -368,6 +368,37 @@ def test_a_resumed_training_ends_as_one_that_never_stopped(tmp_path):
     )
     assert begun[0] == 3  # the checkpoint of update 4 was to follow its callbacks
     th.testing.assert_close(weights(resumed_training), whole, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("trained", "name"), [("trainer", "optimizer"), ("trainer", "yardstick_optimizer"), ("values", "optimizer")]
+)
+def test_a_checkpoint_whose_moments_have_another_size_is_refused(trained, name, tmp_path):
+    """Fused optimizers do not compare sizes: they would read and write beyond what is too short."""
+    learn(folder=tmp_path)
+    path = tmp_path / "planner_checkpoint.zip"
+    state = load_tree(path)
+    state[trained][name][0]["exp_avg"] = th.zeros(1)
+    save_tree(path, state)
+    with pytest.raises(SavedFileError, match=r"does not fit: exp_avg is \(torch\.float32, \(1,\)\)"):
+        learn(folder=tmp_path)
+
+
+def test_values_that_are_not_finite_are_not_handed_over(monkeypatch):
+    step = IQL.step
+
+    def diverge(iql):
+        with th.no_grad():
+            iql.values.v[0].weight.fill_(th.nan)
+        return step(iql)
+
+    model, obs = make(), observe(2)
+    before = answer(model, obs)
+    monkeypatch.setattr(IQL, "step", diverge)
+    with pytest.raises(FloatingPointError, match=r"V\(s\) are no longer finite.*lower learning_rate of iql_kwargs"):
+        learn(model)
+    np.testing.assert_array_equal(answer(model, obs), before)
+    assert not model.policy.planner_is_trained and model.value == "critics"
 
 
 def test_callbacks_of_a_resumed_training_meet_the_planner(tmp_path):
