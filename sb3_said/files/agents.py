@@ -297,6 +297,11 @@ class SafeSaveMixin(Learner):
         if repr(theirs) != repr(own):
             raise ValueError(f"its policy_kwargs are {theirs}, and this agent's {own}; make it with the same")
 
+    @staticmethod
+    def _settings_in(saved: dict[str, Any], name: str) -> dict[str, Any]:
+        """Return one of ``settings_arguments`` as a checkpoint or a file of :meth:`save` has it."""
+        return from_data((saved.get("settings") or saved.get("arguments", {})).get(name, {}))
+
     def _adapt_saved(self, saved: dict[str, Any], changed: set[str]) -> dict[str, Any]:
         """Return what to take over from a file if the caller of ``load`` has changed some arguments."""
         return saved

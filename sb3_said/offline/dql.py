@@ -24,6 +24,10 @@ from sb3_said.offline.learning import OfflineAlgorithm
 from sb3_said.planner.checks import check_settings
 from sb3_said.sac.policies import DelayedSACPolicy, each_part, rows_of, seed_of, settings_of
 
+#: More is a slip, and would cost memory or hours, perhaps of whoever loads a file
+AT_MOST = {"denoising_steps": 1000, "n_candidates": 10_000, "hidden": 16_384, "time_embedding": 16_384}
+NOISE_SETTINGS = "denoising_steps", "beta_min", "beta_max"  # what the weights mean depends on these
+
 
 @dataclass(frozen=True)
 class DQLConfig:
@@ -51,8 +55,8 @@ class DQLConfig:
     start, the initial weights give them (code)"""
 
     def __post_init__(self) -> None:
-        low = {"denoising_steps": 1, "hidden": 1, "time_embedding": 4, "eta": 0, "n_candidates": 1, "ema_every": 1}
-        check_settings(self, low, may_lack=("max_grad_norm",))
+        low = {"denoising_steps": 1, "hidden": 1, "time_embedding": 4, "eta": 0, "n_candidates": 1}
+        check_settings(self, low | {"ema_start": 0, "ema_every": 1}, AT_MOST, may_lack=("max_grad_norm",))
         if self.time_embedding % 2:
             raise ValueError(f"time_embedding is {self.time_embedding}, expected an even number: of sines and cosines.")
         if self.max_grad_norm is not None and not self.max_grad_norm > 0:
@@ -268,6 +272,24 @@ class DQL(OfflineAlgorithm):
 
     def _policy_flags(self) -> dict[str, Any]:
         return {**super()._policy_flags(), "diffusion_kwargs": self.diffusion_kwargs}
+
+    def _check_file(self, saved: dict[str, Any]) -> None:
+        super()._check_file(saved)
+        self._check_noise(saved)
+
+    def _take_settings(self, saved: dict[str, Any]) -> None:
+        super()._take_settings(saved)
+        self._check_noise(saved)
+
+    def _check_noise(self, saved: dict[str, Any]) -> None:
+        """:raises ValueError: for weights that learned another noise than this agent's: they would fit, and mislead"""
+        theirs = settings_of(DQLConfig, self._settings_in(saved, "diffusion_kwargs"), "DQL")
+        given, own = ({name: getattr(x, name) for name in NOISE_SETTINGS} for x in (theirs, self.policy.config))
+        if given != own and saved["counters"]["_n_updates"] > 0:
+            raise ValueError(
+                f"its actor has learned with {given}, and this agent has {own}: give it diffusion_kwargs={given}, or "
+                "train anew"
+            )
 
     def _setup_lr_schedule(self) -> None:
         super()._setup_lr_schedule()

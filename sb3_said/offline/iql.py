@@ -16,6 +16,7 @@ from sb3_said.offline.datasets import Dataset
 from sb3_said.planner.checks import check_same, check_settings, check_stored
 from sb3_said.planner.plain import ZScored
 
+AT_MOST = {"hidden": 16_384, "batch_size": 1_000_000, "updates": 1000}  # more is a slip, and would cost memory or hours
 SMALLEST_SPREAD = 0.1  # of returns, as a part of the largest: nearly equal returns would be scaled up without bound
 
 
@@ -47,7 +48,7 @@ class IQLConfig:
     """of V and Q for each update of the planner (ours: a planner that learns within hours has few; the paper's: one)"""
 
     def __post_init__(self) -> None:
-        check_settings(self, {"hidden": 1, "batch_size": 1, "updates": 1})
+        check_settings(self, {"hidden": 1, "batch_size": 1, "updates": 1}, AT_MOST)
         if not 0.5 <= self.expectile < 1:
             raise ValueError(f"expectile is {self.expectile}, expected a number from 0.5, the mean, up to below 1.")
         if not self.learning_rate > 0 or not 0 < self.target_rate <= 1:

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_said.delays.space import ages_of, has_state_history
 from sb3_said.files.archive import PathOrFile
-from sb3_said.files.arguments import from_data, instead_of
+from sb3_said.files.arguments import instead_of
 from sb3_said.offline import IQLConfig, OfflineAlgorithm
 from sb3_said.offline.learning import listed
 from sb3_said.planner.checks import whole
@@ -171,8 +171,7 @@ class SAID(PlannerLearner, StableSAC):
                 f"agent with student_width={width}, or take load() in place of set_parameters()"
             )
         if policy.get("planner_updates", 0) > 0:
-            settings = saved.get("settings") or saved["arguments"]  # of a checkpoint, or of save()
-            self._check_weights(from_data(settings.get("planner_kwargs", {})), WEIGHT_SETTINGS)
+            self._check_weights(self._settings_in(saved, "planner_kwargs"), WEIGHT_SETTINGS)
 
     def _check_weights(self, given: dict[str, Any], names: Iterable[str]) -> None:
         """:raises ValueError: where a trained planner has other settings than this agent's, of those named"""
@@ -190,7 +189,7 @@ class SAID(PlannerLearner, StableSAC):
         super()._take_settings(saved)
         if not saved["parameters"]["policy"].get("planner_updates", 0):
             return
-        given = from_data(saved.get("settings", {}).get("planner_kwargs", {}))
+        given = self._settings_in(saved, "planner_kwargs")
         self._check_weights(given, [name for name in WEIGHT_SETTINGS if name != "mask"])
         ways = {name: given[name] for name in WAY_SETTINGS if name in given}
         config = settings_of(PlannerConfig, self.planner_kwargs | ways, "The planner")

@@ -11,6 +11,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from test_bc import demonstrations
 from torch.nn import functional as F
 
+from sb3_said.files.archive import SavedFileError, save_tree
+from sb3_said.files.checkpoint import restore_training, training_state
 from sb3_said.offline import DQL, Dataset, DQLConfig
 from sb3_said.offline.dql import schedule
 from sb3_said.offline.learning import take_statistics
@@ -257,6 +259,27 @@ def test_it_learns_is_saved_and_repeats(delay, tmp_path):
     assert other.policy.config == DQLConfig(**SMALL, ema_start=2, ema_every=1, eta=3.0)
 
 
+@pytest.mark.parametrize("noise", [{"denoising_steps": 9}, {"beta_min": 0.2}, {"beta_max": 5.0}], ids=str)
+def test_weights_are_not_taken_under_another_noise(noise, tmp_path):
+    """They would have the same shapes, and answer something else."""
+    other, model = make(diffusion_kwargs=noise), make()
+    model.save(tmp_path / "new.zip")
+    other.set_parameters(tmp_path / "new.zip")  # which have learned nothing
+    model.learn_offline(demonstrations(5), 2)
+    model.save(tmp_path / "saved.zip")
+    save_tree(tmp_path / "checkpoint.zip", training_state(model, keeps_replay=False))
+    name, value = next(iter(noise.items()))
+    told = f"its actor has learned with .*'{name}': {getattr(DQLConfig(**SMALL), name)}.*, and this agent has .*{value}"
+    with pytest.raises(SavedFileError, match=told):
+        DQL.load(tmp_path / "saved.zip", device="cpu", diffusion_kwargs=noise)
+    for path in ("saved.zip", "checkpoint.zip"):
+        with pytest.raises(SavedFileError, match=told):
+            other.set_parameters(tmp_path / path)
+    other.take_dataset(demonstrations(5))
+    with pytest.raises(SavedFileError, match=told):
+        restore_training(other, tmp_path / "checkpoint.zip")
+
+
 def test_only_with_state_augmentation_it_reads_the_actions_since():
     for augment_state in (True, False):
         model = make(delayed(2), augment_state=augment_state)
@@ -292,6 +315,9 @@ def test_arguments_of_another_actor_and_other_critics_are_refused(given):
         ({"denoising_steps": 2.5}, "denoising_steps is 2.5, expected a whole number"),
         ({"eta": "1"}, "eta is '1', expected a finite number"),
         ({"beta_max": np.inf}, "beta_max is inf, expected a finite number"),
+        ({"denoising_steps": 10**9}, "denoising_steps is 1000000000, expected at most 1000"),
+        ({"n_candidates": 10**9}, "n_candidates is 1000000000, expected at most 10000"),
+        ({"ema_start": -5}, "ema_start is -5, expected at least 0"),
     ],
 )
 def test_bad_settings_are_named(setting, message):

@@ -146,6 +146,8 @@ def test_a_resumed_training_ends_as_one_that_never_stopped():
         ("hidden", (0,), "at least 1"),
         ("batch_size", (0,), "at least 1"),
         ("updates", (0,), "at least 1"),
+        ("updates", (10**9,), "at most 1000"),
+        ("batch_size", (10**12,), "at most 1000000"),
     ],
 )
 def test_settings_out_of_range_are_refused(name, values, expected):
