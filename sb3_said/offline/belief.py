@@ -39,7 +39,8 @@ class PlannerBelief:
 
     :param planner: of a trained SAID agent, ``model.policy.planner``
     :param which: ``"inpainted"`` or ``"guessed"``
-    :raises ValueError: for a guess of a planner that has none
+    :raises ValueError: for a present that the planner's settings do not allow, such as a guessed one without a first
+        guess
     """
 
     def __init__(self, planner: InpaintingPlanner, which: str = "inpainted"):
@@ -108,14 +109,11 @@ class RolledOutModel(LearnedBelief):
 
 
 class RegressedPresent(LearnedBelief):
-    """A plain regression from s_{t-d} and the actions sent since to s_t.
+    """A plain regression from s_{t-d} and the actions sent since to s_t."""
 
-    :param hidden: width of the two hidden layers
-    """
-
-    def __init__(self, obs_dim: int, act_dim: int, max_delay: int, hidden: int = 512):
+    def __init__(self, obs_dim: int, act_dim: int, max_delay: int):
         super().__init__(obs_dim, max_delay)
-        self.net = RegressionYardstick(obs_dim, act_dim, max_delay, hidden)
+        self.net = RegressionYardstick(obs_dim, act_dim, max_delay)
 
     def present(self, state: th.Tensor, action_history: th.Tensor, delay: th.Tensor) -> th.Tensor:
         """Return s_t, from one pass of the network: (B, obs_dim)."""

@@ -61,6 +61,11 @@ class Dataset:
         starts = np.concatenate([[0], np.flatnonzero(self.ends)[:-1] + 1])
         return np.add.reduceat(self.rewards.astype(np.float64), starts)
 
+    @property
+    def truncated(self) -> np.ndarray:
+        """Whether a trajectory was cut here, which the task did not end: (N,) bool."""
+        return self.ends & ~self.terminated
+
     def select(self, keep: np.ndarray) -> Dataset:
         """Return some of the trajectories.
 
@@ -100,7 +105,7 @@ class Dataset:
             "actions": self.actions,
             "rewards": self.rewards,
             "dones": self.ends.astype(np.float32),
-            "timeouts": (self.ends & ~self.terminated).astype(np.float32),
+            "timeouts": self.truncated.astype(np.float32),
             "ages": ages,
             "steps": (np.arange(len(self)) - np.repeat(ends + 1 - lengths, lengths)).astype(np.int32),
             "ends": np.append(self.ends[:-1], False),  # what follows the newest row is no tail, but in next_states

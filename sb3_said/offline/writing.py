@@ -16,7 +16,7 @@ from sb3_said.delays.space import check_spaces, unscale_action
 from sb3_said.files.atomic import check_writable, replacing
 from sb3_said.offline.datasets import Dataset, is_file
 from sb3_said.offline.scores import reference_returns
-from sb3_said.offline.sources import TASK, import_minari
+from sb3_said.offline.sources import ABOUT, TASK, import_minari
 
 
 def check_target(target: str | os.PathLike[str]) -> None:
@@ -72,14 +72,14 @@ def _write_npz(data: Dataset, path: str | os.PathLike[str], env: gym.Env[Any, An
     """Write D4RL's columns and the task's id."""
     _, action_space, _ = check_spaces(env.observation_space, env.action_space)
     spec = env.unwrapped.spec
-    columns = {
+    columns: dict[str, Any] = {
         "observations": data.states,
         "actions": unscale_action(data.actions, action_space),
         "rewards": data.rewards,
         "terminals": data.terminated,
-        "timeouts": data.ends & ~data.terminated,
+        "timeouts": data.truncated,
         "next_observations": data.next_states,
-        "about": np.array(about),
+        ABOUT: np.array(about),
         **({} if spec is None else {TASK: np.array(spec.id)}),
     }
     with replacing(path) as file:
@@ -96,7 +96,7 @@ def _write_minari(data: Dataset, name: str, env: gym.Env[Any, Any], about: str, 
     registration = _registration_of(env, name)
     reference = reference_returns(spec.id) if spec is not None else None
     scores = {} if reference is None else {"ref_min_score": reference[0], "ref_max_score": reference[1]}
-    buffers = []
+    buffers, truncated = [], data.truncated
     for i, (stop, length) in enumerate(zip(np.flatnonzero(data.ends) + 1, data.lengths, strict=True)):
         steps = slice(stop - length, stop)
         buffers.append(
@@ -106,7 +106,7 @@ def _write_minari(data: Dataset, name: str, env: gym.Env[Any, Any], about: str, 
                 actions=actions[steps],
                 rewards=data.rewards[steps],
                 terminations=data.terminated[steps],
-                truncations=(data.ends & ~data.terminated)[steps],
+                truncations=truncated[steps],
                 infos={},
             )
         )

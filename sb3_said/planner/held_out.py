@@ -40,9 +40,9 @@ def held_out_errors(
 ) -> dict[str, float]:
     """Return mean absolute errors for every delay d that the windows show.
 
-    ``planner/present_error_d4`` is the error of the decoded s_t at delay 4, in standard deviations of the states;
-    ``planner/action_error_d4`` that of the decision a_t, in [-1, 1]; ``..._mlp_d4`` are the regression's. The planner
-    decodes one candidate at temperature 0.
+    ``planner/present_error_d4`` is the error of s_t at delay 4, in standard deviations of the states: as the planner
+    decodes it, or with ``present="guessed"`` as its first guess has it. ``planner/action_error_d4`` is that of the
+    decision a_t, in [-1, 1]; ``..._mlp_d4`` are the regression's. The planner draws one candidate at temperature 0.
 
     :param held_out: of :func:`draw_held_out`
     """

@@ -43,7 +43,7 @@ def known_window(
     :param observation: (B, obs_dim) delayed observation s_{t-d}
     :param action_history: (B, D, act_dim), the D newest actions, oldest first; D may be 0
     :param delay: (B,) int64 observation delays d, each in 0..D
-    :param length: L > D, steps of a window
+    :param length: L, steps of a window, more than any of the delays
     :param state_history: (B, D, obs_dim), the states s_{t-D+1..t} as far as known, each in the row of the action that
         led to it; none by default
     """

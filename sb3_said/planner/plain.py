@@ -11,7 +11,7 @@ from tqdm.auto import tqdm
 from sb3_said.replay.windows import mean_and_deviation
 
 MODEL_WIDTH, MODEL_BLOCKS = 256, 4
-# In standard deviations: a model asked far from its data must not diverge. Falls in a log without noise lie at 31
+# In standard deviations: a model asked far from its data must not diverge. In a log without noise falls lie at 31
 FARTHEST = 100.0
 RIGHT = 1e-4  # squared error below which an entry counts as known: that of a hundredth of its usual move
 

@@ -26,6 +26,7 @@ class LoopedModel:
         """Return the action that the loop sends in this step: (1, act_dim). An ``episode_start`` resets the loop.
 
         :param observation: (1, ...), not normalised, since the loop normalises
+        :param deterministic: has no effect: the loop was told how to ask its model
         :raises ValueError: for more than one observation
         """
         parts = observation if isinstance(observation, dict) else {"observation": observation}

@@ -89,6 +89,9 @@ class ModelProcess:
                 self._pipe.send(question)
             except OSError as error:
                 raise RuntimeError("The model's process has ended; make another one.") from error
+            except BaseException:
+                self._pipe.close()  # else the next question would get the answer to this one
+                raise
             return self._receive()
 
     def _receive(self, hint: str = "") -> Any:

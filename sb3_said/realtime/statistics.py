@@ -19,7 +19,8 @@ class LoopStatistics:
     """Counts of a :class:`~sb3_said.realtime.ControlLoop`, over all episodes since it was made. Memory is bounded."""
 
     ages: Counter[int] = field(default_factory=Counter)
-    """of the newest observation when an action was sent, in control steps; 1,000 stands for all above, also below"""
+    """of the newest observation when an action was sent, in control steps. Here and in the next two counts 1,000
+    stands for all above"""
     answer_steps: Counter[int] = field(default_factory=Counter)
     """actions sent while an answer was made, of each answer after an episode's first action"""
     gaps: Counter[float] = field(default_factory=Counter)

@@ -19,7 +19,7 @@ from sb3_said.offline.iql import IQL
 from sb3_said.planner.checks import check_same
 from sb3_said.planner.config import PlannerConfig
 from sb3_said.planner.held_out import worse_than_regression
-from sb3_said.planner.trainer import PlannerTrainer
+from sb3_said.planner.trainer import GUESS_UPDATES, GUESS_UPDATES_EACH, PlannerTrainer
 from sb3_said.said.agent import PlannerAgent
 
 PLANNER_CHECKPOINT_NAME = "planner_checkpoint.zip"
@@ -182,9 +182,13 @@ class PlannerTraining:
         self.log({**losses, **value_losses, **errors, "planner/n_updates": self.trainer.n_updates})
         is_end = self.trainer.n_updates == self.trainer.gradient_steps
         if is_end and (worse := worse_than_regression(errors)):
+            # A guessed present is the first guess's, whose updates end at a number of their own
+            is_guess = self.trainer.config.present == "guessed" and "action_error" not in worse
+            has_all = self.trainer.gradient_steps * GUESS_UPDATES_EACH >= GUESS_UPDATES
+            more = "data" if is_guess and has_all else "planner_gradient_steps, or more data"
             warnings.warn(
                 f"On held-out windows the {self.name} is still worse than a small regression: {worse}. It is "
-                "undertrained; give it more planner_gradient_steps, or more data.",
+                f"undertrained; give it more {more}.",
                 stacklevel=6,
             )
         return losses["planner/loss"]

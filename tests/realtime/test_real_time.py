@@ -11,6 +11,7 @@ from bisect import bisect_left
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -120,18 +121,16 @@ def test_a_model_in_a_process_answers_as_here():
             model.predict(observations)
 
 
-def test_after_an_interruption_no_question_gets_the_answer_to_another():
+@pytest.mark.parametrize("amid", ["send", "recv"])
+def test_after_an_interruption_no_question_gets_the_answer_to_another(amid):
     with ModelProcess(partial(Sum, 0.5)) as model:
-        receive = model._pipe.recv
+        pipe = model._pipe
 
-        def interrupted():
-            receive()
+        def interrupted(*args):
+            getattr(pipe, amid)(*args)
             raise KeyboardInterrupt
 
-        class Pipe:
-            recv, send, close = staticmethod(interrupted), model._pipe.send, model._pipe.close
-
-        model._pipe = Pipe()
+        model._pipe = SimpleNamespace(**{"send": pipe.send, "recv": pipe.recv, "close": pipe.close, amid: interrupted})
         with pytest.raises(KeyboardInterrupt):
             model.predict(np.zeros((1, 4)))
         with pytest.raises(RuntimeError, match="has ended; make another one"):

@@ -20,6 +20,7 @@ from sb3_said.planner import InpaintingPlanner
 from sb3_said.planner import trainer as trainer_module
 from sb3_said.planner.first_guess import ROLLED_EACH
 from sb3_said.planner.trainer import GUESS_UPDATES_EACH, PlannerTrainer
+from sb3_said.said import training as training_module
 from sb3_said.said.training import PLANNER_CHECKPOINT_NAME
 
 PLANNER = {"d_model": 32, "depth": 1, "horizon": 3, "batch_size": 16, "sampling_steps": 2, "n_candidates": 3}
@@ -91,6 +92,19 @@ def test_a_planner_worse_than_the_regression_is_not_called_done(is_worse, monkey
         make().learn(15)
     told = [str(w.message) for w in caught if "worse than a small regression" in str(w.message)]
     assert len(told) == is_worse and all("present_error_d2 2 against 1" in message for message in told)
+
+
+@pytest.mark.parametrize(("name", "most", "more"), [
+    ("present", 20, "data"), ("action", 20, "planner_gradient_steps, or more data"),
+    ("present", 40, "planner_gradient_steps, or more data"),
+])  # fmt: skip
+def test_more_updates_are_no_advice_where_the_first_guess_has_had_all_of_its_own(name, most, more, monkeypatch):
+    """Six updates of the planner, and up to five of the guess for each."""
+    errors = {f"planner/{name}_error_d2": 2.0, f"planner/{name}_error_mlp_d2": 1.0}
+    monkeypatch.setattr(PlannerTrainer, "evaluate", lambda self: errors)
+    monkeypatch.setattr(training_module, "GUESS_UPDATES", most)
+    with pytest.warns(UserWarning, match=rf"It is undertrained; give it more {more}\."):
+        make().learn(15)
 
 
 def interrupt_at(monkeypatch, update, error):
