@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import sys
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -102,11 +104,11 @@ def explained(parser: argparse.ArgumentParser, goes_on: bool = False) -> Iterato
     try:
         yield
     except gym.error.UnregisteredEnv as error:
-        parser.error(f"{error} A package that registers a task is named with --gym-packages.")
+        parser.error(f"{told(error)} A package that registers a task is named with --gym-packages.")
     except (ValueError, gym.error.Error) as error:
-        parser.error(str(error))
+        parser.error(told(error))
     except (ImportError, OSError) as error:
-        parser.exit(1, f"{error}\n")
+        parser.exit(1, f"{told(error)}\n")
     except KeyboardInterrupt:
         parser.exit(130, "\nInterrupted." + " Give the same command again to go on." * goes_on + "\n")
 
@@ -120,7 +122,29 @@ def ending_training(*errors: type[Exception]) -> Iterator[None]:
     try:
         yield
     except errors as error:
-        sys.exit(f"sb3-said train: error: {error}")
+        sys.exit(f"sb3-said train: error: {told(error)}")
+
+
+STANDARD, OURS = Path(traceback.__file__).parent, Path(__file__).parents[1]
+INSTALLED = {"site-packages", "dist-packages"}  # names of folders of packages
+
+
+def told(error: BaseException) -> str:
+    """Return an error's message, with file and line if it arose in a task, a wrapper or a module of the user's own.
+
+    :param error: caught around a call; code in the folder of that call is not the user's
+    """
+    catching = {Path(frame.filename).parent for frame in traceback.extract_tb(error.__traceback__)[:2]}
+    cause: BaseException | None = error
+    place = ""
+    while cause is not None:
+        for frame in traceback.extract_tb(cause.__traceback__):
+            folders = Path(frame.filename).parents
+            is_known = {STANDARD, OURS, *catching} & {*folders} or INSTALLED & {folder.name for folder in folders}
+            if not is_known and Path(frame.filename).is_file():
+                place = f" (in {frame.filename}, line {frame.lineno})"
+        cause = cause.__cause__
+    return f"{error}{place}"
 
 
 #: What code in a setting may raise, beside ``ValueError`` and ``TypeError``.

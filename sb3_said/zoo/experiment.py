@@ -6,8 +6,8 @@ import argparse
 import re
 import shutil
 import zlib
-from collections.abc import Sequence
-from contextlib import redirect_stdout
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
@@ -29,13 +29,15 @@ from sb3_said.files.normalization import load_normalization, normalization_file
 from sb3_said.offline import OfflineAlgorithm
 from sb3_said.offline.datasets import is_file
 from sb3_said.zoo.algorithms import ALGORITHMS, NESTED
-from sb3_said.zoo.arguments import Delay, ages_under, ending_training, largest_delay, reading_settings
+from sb3_said.zoo.arguments import CODE_ERRORS, Delay, ages_under, ending_training, largest_delay, reading_settings
 from sb3_said.zoo.folder import claim_folder, find_agent, find_normalization, hold_folder
 from sb3_said.zoo.presets import config_file, preset_overrides
 from sb3_said.zoo.record import EVALUATED, GIVEN_NAME, Record, make_wrapper, options_of, with_delay
 from sb3_said.zoo.stopping import Stopping, shield
 
 LONGEST_NAME = 100  # of what a folder's name says of delays and logs; file systems allow 255
+
+CONFIG_SUFFIXES = ".yml", ".yaml", ".py"  # rl_zoo3 takes anything else for a module
 
 VEC_WRAPPERS = "frame_stack", "vec_env_wrapper"  # of rl_zoo3; no command of ours could play their agents
 for _name in ALGORITHMS:
@@ -89,7 +91,9 @@ class DelayedExperiment(ExperimentManager):
     """
 
     def __init__(self, run: Run, args: argparse.Namespace, algo: str, env_id: str, *zoo_args: Any, **zoo_kwargs: Any):
-        zoo_kwargs["config"] = zoo_kwargs.get("config") or str(config_file(algo, bool(run.dataset)))
+        zoo_kwargs["config"] = config = zoo_kwargs.get("config") or str(config_file(algo, bool(run.dataset)))
+        if Path(config).suffix in CONFIG_SUFFIXES and not Path(config).is_file():
+            raise ValueError(f"--conf-file names {config}, which is not there.")
         super().__init__(args, algo, env_id, *zoo_args, **zoo_kwargs)
         if issubclass(ALGORITHMS[algo][0], OfflineAlgorithm) and self.optimize_hyperparameters:
             raise ValueError(
@@ -146,11 +150,12 @@ class DelayedExperiment(ExperimentManager):
         """
         if self.run.record is None:  # rl_zoo3 would replace dicts of settings whole, instead of merging them
             given, self.custom_hyperparams = self.custom_hyperparams or {}, None
-            with redirect_stdout(StringIO()):
+            with redirect_stdout(StringIO()), self._reading_config():
                 of_file, _ = super().read_hyperparameters()
             of_file = {name: of_file[name] for name in NESTED if name in of_file}
             self.custom_hyperparams = with_given(of_file, given, NESTED)
-        hyperparams, saved = super().read_hyperparameters()
+        with self._reading_config():
+            hyperparams, saved = super().read_hyperparameters()
         if self.n_timesteps <= 0 and "n_timesteps" not in hyperparams:
             raise ValueError(f"{self.config} says no n_timesteps for {self.env_name.gym_id}: add it, or give -n.")
         hyperparams.setdefault("n_timesteps", self.n_timesteps)
@@ -164,12 +169,31 @@ class DelayedExperiment(ExperimentManager):
                     saved[name], hyperparams[name] = (eval(text, vars(exp_manager)) for _ in range(2))
         for settings in (hyperparams, saved):
             settings |= {name: number_of(value) for name, value in settings.items()}
+        steps = hyperparams["n_timesteps"]
+        if self.n_timesteps <= 0 and (not isinstance(steps, int | float) or steps < 1 or steps % 1):
+            raise ValueError(f"n_timesteps must be a whole number, at least 1, got {steps!r}.")
+        rate = hyperparams.get("learning_rate")
+        if isinstance(rate, str) and isinstance(number_of(rate.removeprefix("lin_")), str):
+            raise ValueError(f"learning_rate must be a number, or fall from one as lin_1e-3 does, got {rate!r}.")
         self._own_wrappers = saved.pop("env_wrapper", None)
         wrappers = with_delay(self._own_wrappers, self.run.delay, self.run.expert_delay)
         if wrappers:
             saved["env_wrapper"] = hyperparams["env_wrapper"] = wrappers
             print(f"Wrappers, from the task outwards: {wrappers}")
         return hyperparams, saved
+
+    @contextmanager
+    def _reading_config(self) -> Iterator[None]:
+        """
+        :raises ValueError: for a file of settings that cannot be read
+        """
+        try:
+            yield
+        except CODE_ERRORS as error:
+            raise ValueError(
+                f"{self.config} cannot be read: {error!r}. Expected YAML of settings by task, or Python that has them "
+                "as hyperparams."
+            ) from error
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
         """Preprocess hyper-parameters as rl_zoo3 does; evaluations get the YAML's ``env_kwargs``, too."""
@@ -192,6 +216,8 @@ class DelayedExperiment(ExperimentManager):
             made = super()._preprocess_hyperparams(hyperparams)
         if self.n_envs < 1:
             raise ValueError(f"n_envs must be at least 1, got {self.n_envs}.")
+        if self.n_envs > 1 and "episode" in str(frequency := made[0].get("train_freq")):
+            raise ValueError(f"train_freq={frequency} counts episodes, which takes n_envs=1, got {self.n_envs}.")
         before = self.n_envs if self.run.record is None else self.run.record.hyperparams.get("n_envs", 1)
         if self.n_envs != before and not self.run.dataset:
             raise ValueError(f"--resume goes on with n_envs={before}, as the replay has them, got {self.n_envs}.")

@@ -193,12 +193,11 @@ def play_missing(args: argparse.Namespace, delays: list[int | str]) -> list[Cell
         for label, row in runs.items()
         for cell in cells_of(label, row, delays, args.answer, error)
     ]
+    idle = [*not_playing(runs, delays, args.answer)]
     if not cells:
-        raise ValueError(
-            f"There is nothing to play: no run can answer as --answer {args.answer}."
-            if args.answer
-            else f"There is nothing to play: no run is of the delays {', '.join(map(str, delays))}."
-        )
+        raise ValueError(f"There is nothing to play: {'; '.join(idle)}.")
+    if args.answer and all(answers(run.model) == [None] for row in runs.values() for run in row):
+        raise ValueError(f"--answer {args.answer} has no effect, as no run is of SAID: leave it out.")
     for row, n in Counter(row for row, _ in {(cell.agent, cell.lineage[1]) for cell in cells}).items():
         if n > 1:
             raise ValueError(f"Agents of two labels would both be the row {row!r}: give one another label.")
@@ -207,6 +206,7 @@ def play_missing(args: argparse.Namespace, delays: list[int | str]) -> list[Cell
         print(f"{n} results of {label} are dropped: {file} has changed since.")
     todo = [cell for cell in cells if cell.result is None and cell.obstacle is None]
     print_settings(settings)
+    print(*(f"Left out: {reason}.\n" for reason in idle), sep="", end="")
     for cell in cells:
         if cell.obstacle is not None:
             print(f"{cell.agent} cannot play delay {cell.column}: {cell.obstacle}.")
@@ -279,13 +279,11 @@ def cells_of(
     :param only: who of a SAID agent is to answer; by default everyone who can
     :param age_error: control steps by which the age is told wrong
     """
-    one_delay = len({run.info["delay"] for run in row}) == 1
     digests = [digest_of(run) for run in row]
-    who = [answers(run.model) for run in row]
+    who = [asked_of(run, only) for run in row]
     for answer, delay in itertools.product(dict.fromkeys(itertools.chain(*who)), delays):
         for run, digest, can_answer in zip(row, digests, who, strict=True):
-            plays = one_delay or run.info["delay"] == delay_name(make_process(delay))
-            if not plays or answer not in can_answer or (answer and only and answer != only):
+            if answer not in can_answer or not is_played(delay, run, row):
                 continue
             yield Cell(
                 agent=f"{label} {answer}" if answer else label,
@@ -297,6 +295,35 @@ def cells_of(
                 is_changed=bool(run.changes),
                 **{key: run.info[key] for key in ("algo", "file", "trained_steps")},
             )
+
+
+def asked_of(run: LoadedRun, only: str | None) -> list[str | None]:
+    """Return who can answer in an agent, of a SAID agent ``only`` that one, if it is given."""
+    return [answer for answer in answers(run.model) if not (answer and only) or answer == only]
+
+
+def is_played(delay: int | str, run: LoadedRun, row: list[LoadedRun]) -> bool:
+    """Tell whether a run plays a delay: all of them, or its own where the runs of its label have several."""
+    return len({one.info["delay"] for one in row}) == 1 or run.info["delay"] == delay_name(make_process(delay))
+
+
+def not_playing(runs: dict[str, list[LoadedRun]], delays: list[int | str], only: str | None) -> Iterator[str]:
+    """Say which runs play nothing, and which delays nobody plays, and why.
+
+    :param runs: by label
+    :param only: who of a SAID agent is to answer
+    """
+    pairs = [(run, row) for row in runs.values() for run in row if asked_of(run, only)]
+    for label, row in runs.items():
+        for run in row:
+            if not asked_of(run, only):
+                yield f"{run.info['file']}, which cannot answer as {only}"
+            elif not any(is_played(delay, run, row) for delay in delays):
+                others = f"other runs of {label} have another, so that each plays its own"
+                yield f"{run.info['file']}, whose delay {run.info['delay']} is none of --delays; {others}"
+    for delay in delays:
+        if pairs and not any(is_played(delay, *pair) for pair in pairs):
+            yield f"delay {delay}, which is no run's own; under a label with several delays each run plays its own"
 
 
 def obstacle(run: LoadedRun, answer: str | None, delay: int | str, age_error: int = 0) -> str | None:

@@ -68,12 +68,12 @@ def preset_overrides(
     if not isinstance(block, dict):
         held = "nothing" if block is None else f"a {type(block).__name__}"
         raise ValueError(f"{config} holds {held}, expected settings by task, such as {env_id}: {{n_timesteps: 9000}}.")
-    presets = {"cpu": {"default": {}}, **(document.get("presets") or {})}
+    presets = {"cpu": {"default": {}}, **_part(document, "presets", config)}
     if preset not in presets:
         raise ValueError(f"{config} has no preset '{preset}', only {[*presets]}.")
-    suited = document.get("by_dataset", {}).get(env_id, {}).get(kind, {})
-    blocks = presets[preset] or {}
-    overrides = {**suited, **(blocks.get(env_id, blocks.get("default")) or {})}
+    suited = _part(_part(_part(document, "by_dataset", config), env_id, config), kind, config)
+    blocks = _part(presets, preset, config)
+    overrides = {**suited, **_part(blocks, env_id if env_id in blocks else "default", config)}
     by_kind = overrides.pop("planner_by_dataset", {}).get(kind, {})
     by_delay = {**overrides.pop("planner_by_delay", {}), **by_kind}
     planner = dict(overrides.get("planner_kwargs", {}))
@@ -83,3 +83,14 @@ def preset_overrides(
     if ages_under(delay) != [largest_delay(delay) if max_delay is None else max_delay]:
         planner |= by_delay.get("varies", {})
     return {**overrides, "planner_kwargs": planner} if planner else overrides
+
+
+def _part(settings: dict[str, Any], name: str, config: str | Path) -> dict[str, Any]:
+    """Return the settings of a name, none where there is nothing.
+
+    :raises ValueError: for something else there
+    """
+    part = settings.get(name) or {}
+    if not isinstance(part, dict):
+        raise ValueError(f"{config} holds {part!r} as {name}, expected settings by name.")
+    return part

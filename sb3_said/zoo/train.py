@@ -7,6 +7,7 @@ import os
 import secrets
 import shlex
 import sys
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from sb3_said.zoo.arguments import (
     explained,
     make_parser,
     read_delay,
+    told,
 )
 from sb3_said.zoo.experiment import Run
 from sb3_said.zoo.folder import TUNED_SETTINGS
@@ -51,6 +53,7 @@ folder. Ctrl-C, SIGTERM and SIGHUP write a checkpoint before they end the traini
 Below: the options of rl_zoo3. -optimize is for sac, sa, dr, sadr and stable, --save-replay-buffer not for logs.
 """
 
+TYPED = "<string>"  # the file that code comes from which eval was given
 TEXT = "A VALUE is Python, so that text has quotes of its own: -params \"policy:'MlpPolicy'\"."
 
 
@@ -144,8 +147,8 @@ def main(argv: list[str] | None = None) -> None:
         if made:
             raise
         mend = f": {TO_IMPORT}" * isinstance(error, ImportError)
-        mend += f". {TEXT}" * isinstance(error, (NameError, SyntaxError))
-        parser.error(f"{error}{mend}")  # from the options that rl_zoo3 reads or evaluates
+        mend += f". {TEXT}" * is_of_an_option(error)
+        parser.error(f"{told(error)}{mend}")  # from the options that rl_zoo3 reads or evaluates
     except KeyboardInterrupt:  # before or after the training, which handles it itself
         parser.exit(130, "\nInterrupted.\n")
     finally:
@@ -153,6 +156,13 @@ def main(argv: list[str] | None = None) -> None:
             manager.release()
     if made and made[0].stopping.is_asked:
         sys.exit(130)
+
+
+def is_of_an_option(error: Exception) -> bool:
+    """Tell whether a value on the command line is not the Python that rl_zoo3 takes it for."""
+    if isinstance(error, SyntaxError):
+        return error.filename == TYPED
+    return isinstance(error, NameError) and traceback.extract_tb(error.__traceback__)[-1].filename == TYPED
 
 
 def read_command_line(argv: list[str]) -> tuple[Run, str, list[str]]:
@@ -230,12 +240,16 @@ def joined_settings(argv: list[str]) -> list[str]:
     rl_zoo3 reads only the last use of an option, so a resume that changes one setting would drop the others. If a key
     is given twice, rl_zoo3 takes the later value.
 
-    :raises ValueError: for a word without a colon
+    :raises ValueError: for a word without a colon, and an option without a word
     """
-    settings = argparse.ArgumentParser(add_help=False, allow_abbrev=False)  # "--env" is not short for "--env-kwargs"
+    # "--env" is not short for "--env-kwargs"
+    settings = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     for names in (("-params", "--hyperparams"), ("--env-kwargs",), ("--eval-env-kwargs",), ("--gym-packages",)):
         settings.add_argument(*names, dest=names[0], nargs="+", action="extend", default=[])
-    given, rest = settings.parse_known_args(argv)
+    try:
+        given, rest = settings.parse_known_args(argv)
+    except argparse.ArgumentError as error:
+        raise ValueError(str(error)) from error
     pairs = [(name, word) for name, words in vars(given).items() if name != "--gym-packages" for word in words]
     for name, word in pairs:
         if ":" not in word:

@@ -427,19 +427,40 @@ def test_rows_of_two_labels_are_two(said: Path, sadr: Path, tmp_path: Path, caps
         (["{said}"], ["--delays", "-1"], "whole number of control steps >= 0"),
         (["{said}"], ["--workers", "0"], "must be at least 1"),
         (["{said}"], ["--seed", "1"], "give another --json"),
-        (["{said}"], ["--answer", "student"], "no run can answer as --answer student"),
+        (
+            ["{said}"],
+            ["--answer", "student"],
+            "There is nothing to play: {said}/{env}.zip, which cannot answer as student.",
+        ),
+        (["{sadr}"], ["--answer", "expert"], "--answer expert has no effect, as no run is of SAID"),
     ],
 )
 def test_what_cannot_be_done_is_said(
-    said: Path, tmp_path: Path, runs: list[str], more: list[str], message: str, capsys: pytest.CaptureFixture[str]
+    said: Path,
+    sadr: Path,
+    tmp_path: Path,
+    runs: list[str],
+    more: list[str],
+    message: str,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     file = tmp_path / "out.json"
     settings = {"env": ENV, "n_episodes": 3, "seed": 10_000, "deterministic": True}
     file.write_text(json.dumps({**settings, "origins": [], "cells": []}))
-    paths = {"said": said, "nowhere": tmp_path / "nowhere"}
+    paths = {"said": said, "sadr": sadr, "nowhere": tmp_path / "nowhere", "env": ENV}
     with pytest.raises(SystemExit) as exit_info:
         play(file, [run.format(**paths) for run in runs], ["0"], *more)
-    assert exit_info.value.code == 2 and message in capsys.readouterr().err
+    assert exit_info.value.code == 2 and message.format(**paths) in capsys.readouterr().err
+
+
+def test_who_and_what_is_not_played_is_said(
+    said: Path, sadr: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    document = play(tmp_path / "out.json", [f"each={said}", f"each={sadr}"], ["1", "0"], "--answer", "expert")
+    out = capsys.readouterr().out
+    assert [*by_cell(document)] == [("each", 1)]
+    assert f"Left out: {said}/{ENV}.zip, whose delay 2 is none of --delays; other runs of each have another" in out
+    assert "Left out: delay 0, which is no run's own;" in out and out.count("Left out") == 2
 
 
 @pytest.mark.parametrize("text", ["{}", "[1]", "3", "{"])

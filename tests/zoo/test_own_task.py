@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import sys
 from argparse import Namespace
@@ -196,3 +197,69 @@ def test_a_run_remembers_the_package_of_its_task(
     monkeypatch.setitem(sys.modules, "mine", None)
     with pytest.raises(ImportError, match="package 'mine', which cannot be imported here: install it"):
         load_run(run, device="cpu")
+
+
+OWN = """
+import gymnasium as gym
+{at_import}
+class Own(gym.Env):
+    observation_space = action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+    def __init__(self):
+        {in_init}
+    def reset(self, *, seed=None, options=None):
+        {in_reset}
+        return self.observation_space.sample(), {{}}
+gym.register("Own-v0", Own)
+"""
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        ({"in_init": "raise ValueError('the motor is off')"}, r"the motor is off.* \(in .*, line 7\)"),
+        ({"in_init": "int(None)"}, r"int\(\) argument must be .* \(in .*, line 7\)"),
+        ({"in_init": "open('calibration.csv')"}, r"No such file.*calibration.csv.* \(in .*, line 7\)"),
+        ({"in_init": "gym.spaces.Box([1, 2], 1.0, (1,))"}, r"Box low must be.* \(in .*, line 7\)"),
+        ({"at_import": "import nowhere"}, r"No module named 'nowhere' \(in .*, line 3\): install it"),
+        ({"at_import": "lidar"}, r"name 'lidar' is not defined \(in .*, line 3\)$"),
+        ({"at_import": "1 +"}, r"invalid syntax \(own_\w+.py, line 3\)$"),
+    ],
+)
+def test_a_fault_of_the_users_own_code_names_its_line(
+    fault: dict[str, str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    name = f"own_{tmp_path.name}"  # each test imports a module of its own
+    (tmp_path / f"{name}.py").write_text(OWN.format(**{"at_import": "", "in_init": "pass", "in_reset": "", **fault}))
+    monkeypatch.syspath_prepend(tmp_path)
+    try:
+        with pytest.raises(SystemExit) as stop:
+            train_here(tmp_path / "logs", f"--algo sadr --env {name}:Own-v0 --delay 2 {QUICK}")
+        words = f"{stop.value.code}\n{capsys.readouterr().err}"
+        assert re.search(message, words, re.MULTILINE) and "A VALUE is Python" not in words
+        if "(in" in message:
+            assert f"(in {tmp_path / name}.py, line" in words
+    finally:
+        gym.registry.pop("Own-v0", None)
+
+
+class Still(gym.Env):
+    observation_space = action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+
+
+def test_a_fault_of_the_users_own_code_names_its_line_where_an_agent_plays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = tmp_path / "own_task_playing.py"
+    own.write_text(OWN.format(at_import="", in_init="pass", in_reset="raise ValueError('the motor is off')"))
+    monkeypatch.syspath_prepend(tmp_path)
+    try:
+        DelayedSAC("MultiInputPolicy", DelayedObservationWrapper(Still(), 2), buffer_size=9).save(tmp_path / "a.zip")
+        with pytest.raises(SystemExit):
+            evaluate.main([*f"{tmp_path / 'a.zip'} --algo sadr --env Own-v0 --gym-packages {own.stem}".split()])
+        assert f"the motor is off (in {own}, line 9)" in capsys.readouterr().err
+    finally:
+        gym.registry.pop("Own-v0", None)

@@ -21,6 +21,7 @@ import gymnasium as gym
 from forked import begin, run_script
 from kill import Killed
 from stable_baselines3.common.callbacks import EvalCallback
+from test_cli import call
 from trained_run import ENV, NETWORKS, PLANNER, config_of, same_agents, train_here
 
 from sb3_said import SAID, DelayedSAC, StableSAC
@@ -407,6 +408,9 @@ def test_the_expert_can_learn_under_another_delay(tmp_path: Path, monkeypatch: p
         ("--gym-packages not_there", "No module named 'not_there': install it, or name the folder"),
         ("--checkpoint-freq 0", "--checkpoint-freq must be at least 1, got 0"),
         ("-params gamma:O.9", "invalid syntax"),
+        ("-params gamma:O.9", "A VALUE is Python, so that text has quotes of its own"),
+        ("-params", "usage: sb3-said train [-h]"),
+        ("-params", "argument -params/--hyperparams: expected at least one argument"),
         ("-n 0", "steps are a whole number, at least 1; -1 takes the preset's, got 0"),
         ("--n-timesteps -7", "got -7"),
         ("--device gpu", "auto, cpu, cuda or another that torch has, got gpu"),
@@ -421,14 +425,22 @@ def test_the_expert_can_learn_under_another_delay(tmp_path: Path, monkeypatch: p
         ("-conf {}/list.yml", "list.yml holds a list, expected settings by task"),
         ("-conf {}/empty.yml", "empty.yml holds nothing, expected settings by task, such as Pendulum-v1: {n_timesteps"),
         ("-conf {}/bare.yml", "bare.yml holds nothing, expected settings by task"),
+        ("-conf {}/nowhere.yml", "nowhere.yml, which is not there"),
+        ("-conf {}/presets.yml", "presets.yml holds 3 as presets, expected settings by name"),
+        ("-conf {}/preset.yml --preset smoke", "preset.yml holds 3 as smoke, expected settings by name"),
+        ("-conf {}/of_task.yml --preset smoke", "of_task.yml holds 3 as Pendulum-v1, expected settings by name"),
     ],
 )
-def test_says_what_is_wrong(words: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_says_what_is_wrong(
+    words: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "broken.yml").write_text("a: [1")
-    for name, text in {"list": "- a", "empty": "", "bare": "Pendulum-v1:"}.items():
+    files = {"list": "- a", "empty": "", "bare": "Pendulum-v1:", "presets": "presets: 3"}
+    files |= {"preset": "presets: {smoke: 3}", "of_task": "presets: {smoke: {Pendulum-v1: 3}}"}
+    for name, text in files.items():
         (tmp_path / f"{name}.yml").write_text(text)
     with pytest.raises(SystemExit) as stop:
-        train.main(["--env", "Pendulum-v1", "-f", str(tmp_path), *words.format(tmp_path).split()])
+        call(monkeypatch, "train", *["--env", "Pendulum-v1", "-f", str(tmp_path), *words.format(tmp_path).split()])
     assert stop.value.code == 2 and message in capsys.readouterr().err
 
 
@@ -463,13 +475,24 @@ def test_says_what_is_wrong(words: str, message: str, tmp_path: Path, capsys: py
         ("-params noise_type:'foo' noise_std:0.1", "cannot be read: RuntimeError.*foo"),
         ("-params normalize:'foo('", "cannot be read: SyntaxError"),
         ("-params callback:'rl_zoo3.callbacks.ParallelTrainCallback'", "trains a copy of the agent"),
+        ("-params n_timesteps:-5", "n_timesteps must be a whole number, at least 1, got -5"),
+        ("-params n_timesteps:'abc'", "n_timesteps must be a whole number, at least 1, got 'abc'"),
+        ("-params learning_rate:'abc'", "learning_rate must be a number, or fall from one as lin_1e-3 does, got 'abc'"),
+        ("-params train_freq:(1,'episode') n_envs:2", "counts episodes, which takes n_envs=1, got 2"),
+        ("-conf {}/bare.py", "bare.py cannot be read: KeyError.*expected YAML of settings by task, or Python"),
+        ("-conf {}/broken.py", "broken.py cannot be read: SyntaxError"),
     ],
 )
 def test_settings_that_do_not_fit_are_said_and_leave_no_folder(words: str, message: str, tmp_path: Path) -> None:
-    with pytest.raises(SystemExit, match=f"sb3-said train: error: .*{message}"):
-        train.main(["--env", "Pendulum-v1", "-f", str(tmp_path), "--verbose", "0", *words.split()])
-    assert [file for file in tmp_path.rglob("*") if file.is_file()] == []
-    assert not [*tmp_path.glob("*/*")]
+    (tmp_path / "bare.py").write_text("settings = {}")
+    (tmp_path / "broken.py").write_text("hyperparams = {")
+    logs = tmp_path / "logs"
+    with pytest.raises(SystemExit, match=f"(?i)sb3-said train: error: .*{message}"):
+        train.main(
+            ["--env", "Pendulum-v1", "-f", str(logs), "--verbose", "0", *words.replace("{}", str(tmp_path)).split()]
+        )
+    assert [file for file in logs.rglob("*") if file.is_file()] == []
+    assert not [*logs.glob("*/*")]
 
 
 def test_a_file_without_steps_needs_them_on_the_command_line(tmp_path: Path) -> None:
