@@ -16,8 +16,11 @@ from huggingface_hub import EvalResult, ModelCard, ModelCardData
 
 from sb3_said import SAID, PlannerConfig
 from sb3_said.delays.space import written_ages
+from sb3_said.files.agents import task_of
+from sb3_said.files.archive import load_metadata
 from sb3_said.files.atomic import check_writable, write_text
 from sb3_said.files.normalization import normalization_file
+from sb3_said.zoo.algorithms import ALGORITHMS
 from sb3_said.zoo.arguments import explained, make_parser
 from sb3_said.zoo.cells import Cell, Results
 from sb3_said.zoo.playing import digest_of
@@ -70,10 +73,31 @@ def main(argv: list[str] | None = None) -> None:
         if target.is_file() and not target.read_bytes().startswith(CARD_BEGINS):
             raise ValueError(f"{target} is no model card, and would be replaced: give another --output.")
         record, results = Record.read(args.run), Results(args.returns, None)
+        check_made_by(args.agent, record)
         run = load_run(args.agent, record.algo, record.env, gym_packages=record.gym_packages)
         card = make_card(run, record, results, args.latency, trial_steps(args.run))
         write_text(target, str(card))
         print(f"Wrote {target}")
+
+
+def check_made_by(file: Path, record: Record) -> None:
+    """
+    :param record: of the run that is said to have made the file
+    :raises ValueError: for an agent of another class or task
+    """
+    metadata = load_metadata(file)
+    task = task_of(metadata) or record.env
+    refuse_others(file, {"class": (ALGORITHMS[record.algo][0].__name__, metadata["kind"]), "env": (record.env, task)})
+
+
+def refuse_others(file: Path, made: dict[str, tuple[Any, Any]]) -> None:
+    """
+    :param made: by name what the run has, and what the agent has
+    :raises ValueError: where these differ
+    """
+    if others := {name: pair for name, pair in made.items() if pair[0] != pair[1]}:
+        told = ", ".join(f"{name}={own!r}, and the agent {name}={its!r}" for name, (own, its) in others.items())
+        raise ValueError(f"{file} is not of the run that --run names, which has {told}: name its own.")
 
 
 def trial_steps(folder: Path) -> int:
@@ -100,14 +124,16 @@ def make_card(
     :param n_trial_steps: environment steps of the trials, beyond those of the training
     :raises ValueError: when the results hold nothing of this file, or are of another task than its training
     """
-    made = {"seed": (record.seed, run.model.seed), "env": (record.env, getattr(run.model, "task", None) or record.env)}
-    if others := {name: pair for name, pair in made.items() if pair[0] != pair[1]}:
-        told = ", ".join(f"{name}={own!r}, and the agent {name}={its!r}" for name, (own, its) in others.items())
-        raise ValueError(f"{run.info['file']} is not of the run that --run names, which has {told}: name its own.")
+    refuse_others(Path(run.info["file"]), {"seed": (record.seed, run.model.seed)})
     if run.changes != (trained := changes(record.env_kwargs, record.wrappers)):
         raise ValueError(
             f"{run.info['file']} was trained in a task that its run changes by {trained}, and outside the run's folder "
             f"plays in one changed by {run.changes}. Give the file as it lies in that folder, to over-delays, too."
+        )
+    if results.settings["env"] != record.env:
+        raise ValueError(
+            f"{results.path} holds returns of {results.settings['env']}, and the agent is of {record.env}: give what "
+            "over-delays wrote of it."
         )
     file = Path(run.info["file"])
     digest = digest_of(run)

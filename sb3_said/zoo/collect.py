@@ -62,8 +62,8 @@ examples:
   sb3-said train --algo said --env Hopper-v5 --delay 8 --dataset hopper_medium.npz
 
 Each agent has an equal share of the steps at each noise level; the last episode of a share is cut off where it is full.
-Noise is Gaussian, in units of half the range between an action's bounds. Episode i of an agent at a noise level starts
-from reset seed --seed + i, by default where neither training nor evaluation nor tuning begins.
+Noise is Gaussian, in units of half the range between an action's bounds; random actions get none. Episode i of an agent
+at a noise level starts from reset seed --seed + i, by default where neither training nor evaluation nor tuning begins.
 """
 
 
@@ -219,7 +219,8 @@ def open_agents(args: argparse.Namespace) -> Iterator[Share]:
     """
     import_packages(args.gym_packages)
     names = dict.fromkeys(args.agents)
-    unused = [f"--{name}" for name in ("delay", "stochastic") if getattr(args, name)]
+    unused = [f"--{name}" for name in ("algo", "delay", "stochastic") if getattr(args, name)]
+    unused += ["--noise"] * any(args.noise)
     if unused and [*names] == ["random"]:
         raise ValueError(f"{', '.join(unused)}: for random actions alone this has no effect; leave it out.")
     runs = {name: open_agent(name, args) for name in names if name != "random"}
@@ -262,7 +263,10 @@ def open_agent(name: str, args: argparse.Namespace) -> LoadedRun:
     if args.delay:
         raise ValueError(f"{path} is of Stable-Baselines3, whose agents know no delay: leave out --delay.")
     cls: Any = getattr(stable_baselines3, args.algo.upper(), ALGOS[args.algo])  # "sac" is ours in ALGOS
-    model, info = cls.load(path, device=args.device), {"env": args.env, "algo": args.algo}
+    try:
+        model, info = cls.load(path, device=args.device), {"env": args.env, "algo": args.algo}
+    except (AssertionError, AttributeError, KeyError, RuntimeError, TypeError) as error:  # SB3 checks nothing itself
+        raise ValueError(f"{path} cannot be opened as an agent of --algo {args.algo}: {error!r}") from error
     return LoadedRun(model, partial(gym.make, args.env), normalization_beside(path, args.env), path.parent, info)
 
 

@@ -110,12 +110,18 @@ def test_a_run_that_did_not_make_the_agent_is_refused(
     other = Path(shutil.copytree(run, tmp_path / "other"))
     record = Record.read(run)
     gym.register("SamePendulum-v0", "gymnasium.envs.mujoco.inverted_pendulum_v5:InvertedPendulumEnv")
-    wrong = {"seed=8, and the agent seed=0": {"seed": 8}, "env='SamePendulum-v0', and": {"env": "SamePendulum-v0"}}
+    wrong: dict[str, dict[str, Any]] = {"seed=8, and the agent seed=0": {"seed": 8}}
+    wrong |= {f"env={env!r}, and the agent env={ENV!r}": {"env": env} for env in ("SamePendulum-v0", "Hopper-v5")}
+    wrong |= {"class='DelayedSAC', and the agent class='SAID'": {"algo": "sadr"}}
     for told, change in wrong.items():
         replace(record, **change).write(other)
         with pytest.raises(SystemExit):
             card.main([str(file), "--run", str(other), "--returns", str(returns), "-o", str(tmp_path / "card.md")])
         assert told in capsys.readouterr().err
+    returns.write_text(returns.read_text().replace(ENV, "Hopper-v5"))
+    with pytest.raises(SystemExit):
+        card.main([str(file), "--run", str(run), "--returns", str(returns), "-o", str(tmp_path / "card.md")])
+    assert f"returns.json holds returns of Hopper-v5, and the agent is of {ENV}" in capsys.readouterr().err
     assert not (tmp_path / "card.md").exists()
 
 

@@ -284,11 +284,11 @@ def test_a_changed_task_is_said(
     assert "changed by" not in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("agent", ["random", "sac.zip"])
+@pytest.mark.parametrize("agent", ["random", "sac.zip --algo sac"])
 def test_a_task_of_a_package_is_found(agent: str, own_task: str, tmp_path: Path) -> None:
     SAC("MlpPolicy", ENV, buffer_size=10, device="cpu", seed=0).save(tmp_path / "sac.zip")
-    player = agent if agent == "random" else str(tmp_path / agent)
-    words = player, "--algo", "sac", "--env", "Own-v0", "--gym-packages", own_task, "--steps", "20"
+    player = agent.replace("sac.zip", str(tmp_path / "sac.zip")).split()
+    words = *player, "--env", "Own-v0", "--gym-packages", own_task, "--steps", "20"
     collect.main([*words, "-o", str(tmp_path / "own.npz"), "--device", "cpu"])
     assert len(load_dataset(tmp_path / "own.npz", *spaces_of(ENV), "Own-v0")) == 20
 
@@ -325,6 +325,9 @@ def test_a_normalisation_of_another_task_is_said(tmp_path: Path, capsys: pytest.
         ("{run} random -o {tmp}/x.npz --steps 1", "fewer than there are shares, 2"),
         ("random -o {tmp}/x.npz", "of no task: give --env"),
         (f"random --env {ENV} --delay 3 --stochastic -o {{tmp}}/x.npz", "--delay, --stochastic: for random actions"),
+        (f"random --env {ENV} --algo sac --noise 0 1 -o {{tmp}}/x.npz", "--algo, --noise: for random actions alone"),
+        (f"{{tmp}}/sac.zip --algo td3 --env {ENV} -o {{tmp}}/x.npz", "cannot be opened as an agent of --algo td3"),
+        (f"{{tmp}}/sac.zip --algo ppo --env {ENV} -o {{tmp}}/x.npz", "cannot be opened as an agent of --algo ppo"),
         ("nowhere -o {tmp}/x.npz", "nowhere does not exist"),
     ],
 )
@@ -332,6 +335,7 @@ def test_says_what_is_wrong(
     words: str, message: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (run / "there.npz").touch()
+    SAC("MlpPolicy", ENV, buffer_size=10, device="cpu", seed=0).save(tmp_path / "sac.zip")
     with pytest.raises(SystemExit) as stop:
         collect.main(words.format(run=run, tmp=tmp_path).split())
     assert stop.value.code == 2 and message in capsys.readouterr().err
