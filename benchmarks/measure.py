@@ -20,6 +20,7 @@ from sb3_said.evaluation import Interval, confidence_interval
 from sb3_said.evaluation.statistics import FEWEST_RESAMPLED
 from sb3_said.files import atomic as files
 from sb3_said.planner.precision import has_bfloat16
+from sb3_said.zoo.arguments import explained
 
 PATIENCE = 2.0  # seconds after which a measurement shows its progress
 DTYPES = {"float32": th.float32, "bfloat16": th.bfloat16}
@@ -152,17 +153,33 @@ def write_json(path: Path | None, args: argparse.Namespace, rows: Sequence[Mappi
     files.write_json(path, {**result, "rows": list(rows), **more}, default=_plain)
 
 
+def read_json(path: Path) -> Any:
+    """
+    :raises ValueError: for a file that is no JSON
+    """
+    try:
+        return json.loads(path.read_text())
+    except ValueError as error:
+        raise ValueError(f"{path} is no JSON: {error}.") from error
+
+
 def resumed(p: argparse.ArgumentParser, path: Path, settings: dict[str, Any], **empty: Any) -> dict[str, Any]:
-    """Return what a file of ``--json`` holds, or a document with nothing in it yet.
+    """Return what a file of ``--json`` holds, or a document with nothing in it but the settings yet.
 
     The program ends if the file has other settings.
 
     :param p: reports the error
     :param empty: parts of a new document
     """
-    document: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {"settings": settings, **empty}
-    if (found := document.get("settings")) != settings:
-        p.error(f"{path} has rows of {found}, and these would be of {settings}; give another --json.")
+    if not path.exists():
+        return {**settings, **empty}
+    with explained(p):
+        document: dict[str, Any] = read_json(path)
+        if not isinstance(document, dict) or not empty.keys() <= document.keys():
+            raise ValueError(f"{path} was not written by --json of this program: give another.")
+        if found := {name: document.get(name) for name in settings if document.get(name) != settings[name]}:
+            asked = {name: settings[name] for name in found}
+            raise ValueError(f"{path} holds results of {found}, but {asked} was asked for: give another --json.")
     return document
 
 

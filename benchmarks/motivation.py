@@ -47,6 +47,8 @@ from sb3_said.offline.belief import (
     belief_error,
     train_belief,
 )
+from sb3_said.sac.policies import settings_of
+from sb3_said.zoo.arguments import explained
 from sb3_said.zoo.folder import find_agent
 from sb3_said.zoo.runs import LoadedRun, load_run, origin
 
@@ -110,18 +112,23 @@ class GuessAlone:
 def split(data: Dataset, held_out: float, seed: int) -> tuple[Dataset, Dataset]:
     """Return training and held-out episodes.
 
-    :raises ValueError: when there are fewer than two episodes
+    :raises ValueError: when either part would have no episode
     """
+    if not 0 < held_out < 1:
+        raise ValueError(f"--held-out is a part of the episodes, above 0 and below 1, got {held_out}.")
     n = len(data.lengths)
     if n < 2:
         raise ValueError(f"The data has {n} episode; two are needed, one of them to hold out.")
     is_held = np.zeros(n, bool)
-    is_held[np.random.default_rng(seed).permutation(n)[: max(1, round(n * held_out))]] = True
+    is_held[np.random.default_rng(seed).permutation(n)[: min(max(1, round(n * held_out)), n - 1)]] = True
     return data.select(~is_held), data.select(is_held)
 
 
-def train(data: Dataset, args: argparse.Namespace) -> tuple[dict[str, Belief], Any, SAID, BC]:
-    """Train, and return the beliefs by name, the actor without delay, and the agents that decide under delay."""
+def train(data: Dataset, actor: Any, args: argparse.Namespace) -> tuple[dict[str, Belief], Any, SAID, BC]:
+    """Train, and return the beliefs by name, the actor without delay, and the agents that decide under delay.
+
+    :param actor: None for a clone of the data
+    """
     task = gym.make(args.env)
     env = DelayedObservationWrapper(gym.make(args.env), delay=(0, args.max_delay))
     said = SAID(
@@ -145,7 +152,7 @@ def train(data: Dataset, args: argparse.Namespace) -> tuple[dict[str, Belief], A
         bc = BC("MultiInputPolicy", env, seed=args.seed, device=args.device, buffer_size=args.max_delay + 2)
         return bc.learn_offline(data, args.plain_steps, progress_bar=True)
 
-    actor: Any = clone(task) if args.actor is None else load_agent(args.actor, args.device).model
+    actor = actor or clone(task)
     beliefs: dict[str, Belief] = {"inpainted": PlannerBelief(said.policy.planner)}
     if "guessed" in args.players:
         beliefs["guessed"] = PlannerBelief(said.policy.planner, "guessed")
@@ -229,7 +236,8 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     p.add_argument("--json", type=Path)
     p.add_argument("--plot", type=Path)
     args = p.parse_args(argv)
-    config = PlannerConfig(**args.planner_kwargs)
+    with explained(p):
+        config = settings_of(PlannerConfig, args.planner_kwargs, "The planner")
     if config.mask == "none":
         p.error("A planner with mask=none inpaints no present, which is what is compared here; give another mask.")
     if config.first_guess == "none" and {"guessed", GUESS_ALONE} & {*args.players}:
@@ -240,10 +248,12 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     args.plain_steps = args.plain_steps or args.gradient_steps
     th.set_num_threads(args.num_threads)
 
-    task = gym.make(args.env)
-    data = load_dataset(args.dataset, task.observation_space, task.action_space, args.env, progress_bar=True)
-    training, held = split(data, args.held_out, args.seed)
-    beliefs, actor, said, cloning = train(training, args)
+    with explained(p):
+        task = gym.make(args.env)
+        data = load_dataset(args.dataset, task.observation_space, task.action_space, args.env, progress_bar=True)
+        training, held = split(data, args.held_out, args.seed)
+        given = None if args.actor is None else load_agent(args.actor, args.device).model
+    beliefs, actor, said, cloning = train(training, given, args)
     document: dict[str, Any] = {k: v for k, v in vars(args).items() if k not in ("folder", "json", "plot")}
     document |= {"training_steps": len(training), "held_out_steps": len(held), "held_out_episodes": len(held.lengths)}
     document["planner"] = said.policy.planner.config.to_dict()

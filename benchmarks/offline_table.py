@@ -16,15 +16,14 @@ paper   what Table 2 of arXiv 2603.01553 has for SAID and DQL+SA at these delays
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measure import print_table
+from measure import print_table, read_json
 
 from sb3_said.evaluation import plots
-from sb3_said.offline import normalized_score
+from sb3_said.offline import normalized_score, reference_returns
 from sb3_said.zoo.arguments import explained
 
 DELAYS = (0, 4, 8, 16)
@@ -57,21 +56,34 @@ def read(path: Path, name: str | None) -> tuple[str, dict[str, dict[int, list[fl
     """Return the task of a file, and its returns by agent and delay.
 
     :param name: of the agent in a file of over-delays
-    :raises ValueError: for such a file of several agents, or of one that answers in several ways
+    :raises ValueError: for such a file of several agents, or of one that answers in several ways; for one that holds
+        nothing of the table's delays, is of a task without reference returns, or of something else
     """
-    document = json.loads(path.read_text())
+    document = read_json(path)
+    try:
+        env, rows = document["env"], _rows(document, name or path.stem)
+    except (AttributeError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} is neither of motivation.py nor of sb3-said over-delays: {error!r}.") from error
+    except ValueError as error:
+        raise ValueError(f"{path} {error}") from error
+    if reference_returns(env) is None:
+        raise ValueError(f"{path} is of {env}, for which D4RL has no reference returns, and so no score.")
+    if not any(delay in row for row in rows.values() for delay in DELAYS):
+        raise ValueError(f"{path} holds no returns of these agents at delays {DELAYS}.")
+    return env, rows
+
+
+def _rows(document: dict[str, Any], name: str) -> dict[str, dict[int, list[float]]]:
     if "cells" not in document:
-        rows = {
+        return {
             NAMES[player]: dict(zip(document["delays"], (row["returns"] for row in summaries), strict=True))
             for player, summaries in document["returns"].items()
             if player in NAMES
         }
-        return document["env"], rows
     cells = [cell for cell in document["cells"] if cell["result"] is not None and not cell.get("age_error")]
     if len(agents := sorted({(cell["sha256"], str(cell["answer"])) for cell in cells})) > 1:
-        raise ValueError(f"{path} holds {len(agents)} agents or answers, expected those of one agent, in one way.")
-    played = {cell["delay"]: cell["result"]["returns"] for cell in cells}
-    return document["env"], {name or path.stem: played}
+        raise ValueError(f"holds {len(agents)} agents or answers, expected those of one agent, in one way.")
+    return {name: {cell["delay"]: cell["result"]["returns"] for cell in cells}}
 
 
 def table(files: list[tuple[str, str | None, Path]]) -> dict[tuple[str, str], dict[str, Seeds]]:
@@ -97,7 +109,7 @@ def show(found: dict[tuple[str, str], dict[str, Seeds]]) -> None:
                 each = f" [{', '.join(f'{score:.1f}' for score in scores)}]" if len(scores) > 1 else ""
                 cells[f"delay {delay}"] = f"{np.mean(scores):.1f}{each}" if scores else ""
             for d in DELAYS[1:]:
-                cells[f"kept at {d}"] = f"{np.mean(seeds[d]) / np.mean(seeds[0]):.2f}" if d in seeds else ""
+                cells[f"kept at {d}"] = f"{np.mean(seeds[d]) / np.mean(seeds[0]):.2f}" if {0, d} <= {*seeds} else ""
             cells["paper"] = ", ".join(map(str, PAPER.get((kind, env), {}).get(agent, ())))
             table.append(cells)
     print_table(table)

@@ -16,13 +16,12 @@ worst run   its mean over the mean of all runs
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measure import print_table
+from measure import print_table, read_json
 
 from sb3_said.files.atomic import write_json
 from sb3_said.zoo.arguments import explained
@@ -38,7 +37,7 @@ def read_runs(name: str, path: Path) -> list[dict[str, Any]]:
     :raises ValueError: where it holds none
     """
     if path.is_file():
-        runs = json.loads(path.read_text())
+        runs = read_json(path)
         if not isinstance(runs, list):
             raise ValueError(f"{path} was not written by --json of this program, and is no run's folder.")
         if found := [run for run in runs if name in ("", run["name"])]:

@@ -36,7 +36,6 @@ from __future__ import annotations
 import argparse
 import copy
 import hashlib
-import json
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -46,7 +45,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
-from measure import print_table, progress
+from measure import print_table, progress, resumed
 from motivation import GUESS_ALONE, INPAINTING, AllAtOnce, GuessAlone, dict_of, load_agent
 from tqdm import tqdm
 
@@ -301,10 +300,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     settings: dict[str, Any] = {key: getattr(args, key) for key in ("updates", "episodes", "eval_seed")}
     settings |= agent_of(model, args)
     settings |= {f"planner_{name}": value for name, value in preset.to_dict().items()}
-    document = json.loads(args.json.read_text()) if args.json.exists() else {**settings, "returns": {}}
-    if given := {key: document.get(key) for key in settings if document.get(key) != settings[key]}:
-        asked = {key: settings[key] for key in given}
-        p.error(f"{args.json} holds results of {given}, but {asked} was asked for: give another --json.")
+    document = resumed(p, args.json, settings, returns={})
     returns: dict[str, dict[str, list[float]]] = document["returns"]
 
     keys = [f"{row}/{seed}" for row in args.rows for seed in ([None] if row in ALONE else args.seeds)]

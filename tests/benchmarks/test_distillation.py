@@ -49,7 +49,7 @@ def test_students_are_played_beside_their_planner(
     assert script.main([*words, "--seeds", "5"]) == rows
     with pytest.raises(SystemExit):
         script.main([*words, "--episodes", "3"])
-    assert "has rows of {" in capsys.readouterr().err
+    assert "holds results of {" in capsys.readouterr().err
 
 
 def test_a_log_takes_the_replays_place(run: Path, tmp_path: Path) -> None:

@@ -101,3 +101,21 @@ def test_tables_and_files(tmp_path, capsys):
 
 def test_percentiles_are_numpys_in_milliseconds():
     assert measure.percentiles(np.arange(101) / 1000) == pytest.approx({"p50_ms": 50, "p95_ms": 95, "p99_ms": 99})
+
+
+def test_a_file_of_rows_is_read_again_only_if_it_is_of_the_same(tmp_path, capsys):
+    p, file = argparse.ArgumentParser(), tmp_path / "rows.json"
+    document = measure.resumed(p, file, {"seed": 1}, rows={})
+    assert document == {"seed": 1, "rows": {}}
+    file.write_text(json.dumps({**document, "rows": {"a": 2}}))
+    assert measure.resumed(p, file, {"seed": 1}, rows={})["rows"] == {"a": 2}
+    for text, settings, message in (
+        (file.read_text(), {"seed": 2}, "holds results of {'seed': 1}, but {'seed': 2} was asked for"),
+        ("{", {}, "rows.json is no JSON"),
+        ("[]", {}, "was not written by --json of this program"),
+        ('{"seed": 1}', {"seed": 1}, "was not written by --json of this program"),
+    ):
+        file.write_text(text)
+        with pytest.raises(SystemExit):
+            measure.resumed(p, file, settings, rows={})
+        assert message in capsys.readouterr().err

@@ -44,6 +44,27 @@ def test_selected_and_held_out_trajectories_are_whole(log):
         np.testing.assert_array_equal(part.states[: part.lengths[0]], log.states[start : start + log.lengths[i]])
     with pytest.raises(ValueError, match="two are needed"):
         motivation.split(log.select(np.arange(12) == 3), 0.1, seed=0)
+    assert len(motivation.split(log, 0.99, seed=0)[0].lengths) == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--dataset nowhere.npz", "nowhere.npz"),
+        ("--dataset {log} --env Walker2d-v5", "is of InvertedPendulum-v5, and the task is Walker2d-v5"),
+        ("--dataset {log} --env Nosuch-v1", "doesn't exist"),
+        ("--dataset {log} --held-out 2", "--held-out is a part of the episodes, above 0 and below 1, got 2"),
+        ("--dataset {log} --actor nowhere", "nowhere does not exist"),
+        ("--dataset {log} --planner-kwargs depth=0", "depth"),
+        ("--dataset {log} --planner-kwargs deepth=3", "The planner has no setting deepth; did you mean depth"),
+    ],
+)
+def test_what_is_wrong_is_said_before_anything_is_trained(words, message, log, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(motivation, "train", lambda *_: pytest.fail("it trains"))
+    write_dataset(log, tmp_path / "log.npz", gym.make(ENV))
+    with pytest.raises(SystemExit) as stop:
+        motivation.main(["--env", ENV, *words.format(log=tmp_path / "log.npz").split()])
+    assert stop.value.code in (1, 2) and message in capsys.readouterr().err
 
 
 def test_it_measures_errors_and_returns_of_each_belief(log, tmp_path, capsys):

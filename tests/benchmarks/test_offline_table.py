@@ -57,3 +57,28 @@ def test_a_word_without_a_file_is_refused(capsys):
     with pytest.raises(SystemExit):
         offline_table.main(["medium"])
     assert "medium=hopper-medium-0.json" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "agent.json is no JSON"),
+        ("[1]", "agent.json is neither of motivation.py nor of sb3-said over-delays"),
+        ("{}", "agent.json is neither of motivation.py nor of sb3-said over-delays: KeyError('env')"),
+        ('{"env": "Hopper-v5", "cells": [3]}', "agent.json is neither of motivation.py nor of"),
+        ({"env": "Pendulum-v1", "cells": [cell(0, 5.0)]}, "is of Pendulum-v1, for which D4RL has no reference returns"),
+        ({"env": "Hopper-v5", "cells": [cell(3, 5.0), cell(4, None)]}, "holds no returns of these agents at delays"),
+    ],
+)
+def test_another_file_is_no_traceback(text, message, tmp_path, capsys):
+    file = tmp_path / "agent.json"
+    file.write_text(text if isinstance(text, str) else json.dumps(text))
+    with pytest.raises(SystemExit):
+        offline_table.main([f"medium,x={file}"])
+    assert message in capsys.readouterr().err
+
+
+def test_without_delay_0_no_part_is_kept(tmp_path, capsys):
+    (tmp_path / "a.json").write_text(json.dumps({"env": "Hopper-v5", "cells": [cell(8, 1607.0)]}))
+    offline_table.main([f"medium={tmp_path}/a.json"])
+    assert "| Hopper-v5 medium | a |  |  | 50.0 |  |  |  |  |  |" in capsys.readouterr().out
