@@ -31,7 +31,7 @@ class Interval:
     method: str
 
     def __str__(self) -> str:
-        return f"{self.value:.1f} [{self.low:.1f}, {self.high:.1f}]"
+        return f"{self.value:.1f}" + f" [{self.low:.1f}, {self.high:.1f}]" * (self.n > 1)
 
 
 @dataclass(frozen=True)

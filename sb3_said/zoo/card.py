@@ -216,8 +216,9 @@ def describe(
         "|---|---|",
         *(f"| {name} | {value} |" for name, value in facts.items()),
         "",
-        f"Mean returns of {n_episodes} episodes (reset seeds {seed}..{seed + n_episodes - 1}) with 95 % intervals over "
-        "these episodes, of one training seed:",
+        f"Mean returns of {n_episodes} episodes (reset seeds {seed}..{seed + n_episodes - 1})"
+        + " with 95 % intervals over these episodes" * (n_episodes > 1)
+        + ", of one training seed:",
         "",
     ]
     columns = list(dict.fromkeys(cell.column for cell in cells))

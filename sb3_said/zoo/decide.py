@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import shutil
 from pathlib import Path
 from typing import Any
@@ -176,7 +177,10 @@ def keep_normalization(agent: Path, output: Path) -> None:
 
 def number_or_none(word: str) -> float | str:
     """Return the number that a word is, or the word ``none``."""
-    return word if word == "none" else float(word)
+    try:
+        return word if word == "none" else float(word)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"a number, or none, got {word}") from error
 
 
 def load_said(path: Path) -> SAID:

@@ -223,7 +223,7 @@ def _columns(summary: Summary | None, env_id: str) -> str:
     if summary is None:  # this answer did not exist yet when the best agent was saved
         return f"{'-':>12} {'-':>24} {'-':>7} {'-':>8}"
     mean, scores = summary.mean_return, score_of(summary, env_id)
-    interval = f"[{mean.low:,.1f}, {mean.high:,.1f}]"
+    interval = "-" if mean.n == 1 else f"[{mean.low:,.1f}, {mean.high:,.1f}]"
     score = "-" if scores is None else f"{scores[0]:.1f}"
     return f"{mean.value:12,.1f} {interval:>24} {score:>7} {summary.mean_length.value:8,.1f}"
 

@@ -200,6 +200,8 @@ def average(
     if len({one.shape for one in returns}) > 1 or not (is_paired or len(returns) == 1):
         return f"{np.mean([one.mean() for one in returns]):.1f}{covered}", ""
     found = interval(np.mean(returns, axis=0))  # from (delays, n_episodes) or (delays, seeds, n_episodes)
+    if returns[0].size == 1:  # an episode by itself tells nothing about the spread
+        return f"{found}{covered}", ""
     units = f"{found.n} episodes"
     if returns[0].ndim == 2:
         n_seeds, n_episodes = returns[0].shape

@@ -125,7 +125,7 @@ def test_interval_of_constant_and_single_values() -> None:
         constant = confidence_interval([0.1] * 7, statistic)
         assert (constant.value, constant.low, constant.high) == pytest.approx((0.1, 0.1, 0.1), abs=1e-15)
     one = confidence_interval([3.0])
-    assert one.value == 3.0 and np.isnan(one.low) and np.isnan(one.high)
+    assert one.value == 3.0 and np.isnan(one.low) and np.isnan(one.high) and str(one) == "3.0"
 
 
 @settings(deadline=None, max_examples=30)

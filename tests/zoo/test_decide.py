@@ -178,7 +178,7 @@ def test_without_settings_it_shows_them(run: Path, capsys: pytest.CaptureFixture
         (["{run}", "--expert-up-to", "1"], "-o is missing"),
         (["{run}", "--expert-up-to", "1", "-o", "x.zip"], "--answer both and --expert-up-to or --expert-from need"),
         (["{run}", "--answer", "both", "--expert-up-to", "9", "-o", "x.zip"], "answers up to an age in 0..1"),
-        (["{run}", "--choice-factor", "best", "-o", "x.zip"], "invalid"),
+        (["{run}", "--choice-factor", "best", "-o", "x.zip"], "--choice-factor: a number, or none, got best"),
         (["{sadr}"], "is a run of 'sadr', which has no planner"),
         (["{sadr_zip}"], "SAID"),
         (["nowhere"], "does not exist"),

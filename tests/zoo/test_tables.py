@@ -22,6 +22,7 @@ def test_an_average_pairs_episodes_of_one_start() -> None:
     assert average(row, [0, 4]) == ("5.0 [5.0, 5.0]", over)  # each start has a mean of 5
     assert average(row, [0, 4, 8]) == ("5.0 [5.0, 5.0], 2 of 3", over)
     assert average(row, [8]) == ("-", "")
+    assert average({0: np.array([3.0])}, [0]) == ("3.0", "")  # an episode by itself tells nothing about the spread
 
 
 def test_scores_are_the_returns_between_those_of_a_random_policy_and_an_expert(
