@@ -1,5 +1,6 @@
 """Settings of all tests."""
 
+import gc
 import multiprocessing
 from contextlib import nullcontext
 
@@ -11,6 +12,12 @@ from small_planner import with_small_first_guesses
 multiprocessing.set_forkserver_preload(["sb3_said.zoo.train", "torch._dynamo", "mujoco"])
 settings.register_profile("suite", max_examples=30, deadline=None)  # five minutes for all tests on two cores
 settings.load_profile("suite")
+
+
+def pytest_collection_finish():
+    """Let no collection of garbage look again and again at what the imports have left."""
+    gc.collect()
+    gc.freeze()
 
 
 # Their agents are loaded by processes of the package's own, or come from files; or they ask how well it is learned
