@@ -152,14 +152,16 @@ CODE_ERRORS = (ArithmeticError, AttributeError, LookupError, NameError, RuntimeE
 
 
 @contextmanager
-def reading_settings() -> Iterator[None]:
+def reading_settings(what: str = "A setting", expected: str = "") -> Iterator[None]:
     """
-    :raises ValueError: for a setting whose code fails, or names something that does not exist
+    :param what: what is read, for the error
+    :param expected: end of its message
+    :raises ValueError: for settings whose code fails, or names something that does not exist
     """
     try:
         yield
     except CODE_ERRORS as error:
-        raise ValueError(f"A setting cannot be read: {error!r}") from error
+        raise ValueError(f"{what} cannot be read: {error!r}{expected}") from error
 
 
 def read_delay(words: list[str]) -> Delay:

@@ -6,9 +6,10 @@ import argparse
 import re
 import shutil
 import zlib
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, redirect_stdout
+from collections.abc import Sequence
+from contextlib import redirect_stdout
 from dataclasses import dataclass
+from functools import partial
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from sb3_said.files.normalization import load_normalization, normalization_file
 from sb3_said.offline import OfflineAlgorithm
 from sb3_said.offline.datasets import is_file
 from sb3_said.zoo.algorithms import ALGORITHMS, NESTED
-from sb3_said.zoo.arguments import CODE_ERRORS, Delay, ages_under, ending_training, largest_delay, reading_settings
+from sb3_said.zoo.arguments import Delay, ages_under, ending_training, largest_delay, reading_settings
 from sb3_said.zoo.folder import claim_folder, find_agent, find_normalization, hold_folder
 from sb3_said.zoo.presets import config_file, preset_overrides
 from sb3_said.zoo.record import EVALUATED, GIVEN_NAME, Record, make_wrapper, options_of, with_delay
@@ -38,7 +39,7 @@ from sb3_said.zoo.stopping import Stopping, shield
 LONGEST_NAME = 100  # of what a folder's name says of delays and logs; file systems allow 255
 
 CONFIG_SUFFIXES = ".yml", ".yaml", ".py"  # rl_zoo3 takes anything else for a module
-
+EXPECTED = ". Expected YAML of settings by task, or Python that has them as hyperparams."
 VEC_WRAPPERS = "frame_stack", "vec_env_wrapper"  # of rl_zoo3; no command of ours could play their agents
 for _name in ALGORITHMS:
     HYPERPARAMS_SAMPLER[_name] = HYPERPARAMS_SAMPLER["sac"]
@@ -148,13 +149,14 @@ class DelayedExperiment(ExperimentManager):
 
         The delay goes around the user's own wrappers, and text that is code is evaluated.
         """
+        reading_config = partial(reading_settings, self.config, EXPECTED)
         if self.run.record is None:  # rl_zoo3 would replace dicts of settings whole, instead of merging them
             given, self.custom_hyperparams = self.custom_hyperparams or {}, None
-            with redirect_stdout(StringIO()), self._reading_config():
+            with redirect_stdout(StringIO()), reading_config():
                 of_file, _ = super().read_hyperparameters()
             of_file = {name: of_file[name] for name in NESTED if name in of_file}
             self.custom_hyperparams = with_given(of_file, given, NESTED)
-        with self._reading_config():
+        with reading_config():
             hyperparams, saved = super().read_hyperparameters()
         if self.n_timesteps <= 0 and "n_timesteps" not in hyperparams:
             raise ValueError(f"{self.config} says no n_timesteps for {self.env_name.gym_id}: add it, or give -n.")
@@ -181,19 +183,6 @@ class DelayedExperiment(ExperimentManager):
             saved["env_wrapper"] = hyperparams["env_wrapper"] = wrappers
             print(f"Wrappers, from the task outwards: {wrappers}")
         return hyperparams, saved
-
-    @contextmanager
-    def _reading_config(self) -> Iterator[None]:
-        """
-        :raises ValueError: for a file of settings that cannot be read
-        """
-        try:
-            yield
-        except CODE_ERRORS as error:
-            raise ValueError(
-                f"{self.config} cannot be read: {error!r}. Expected YAML of settings by task, or Python that has them "
-                "as hyperparams."
-            ) from error
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
         """Preprocess hyper-parameters as rl_zoo3 does; evaluations get the YAML's ``env_kwargs``, too."""

@@ -479,7 +479,7 @@ def test_says_what_is_wrong(
         ("-params n_timesteps:'abc'", "n_timesteps must be a whole number, at least 1, got 'abc'"),
         ("-params learning_rate:'abc'", "learning_rate must be a number, or fall from one as lin_1e-3 does, got 'abc'"),
         ("-params train_freq:(1,'episode') n_envs:2", "counts episodes, which takes n_envs=1, got 2"),
-        ("-conf {}/bare.py", "bare.py cannot be read: KeyError.*expected YAML of settings by task, or Python"),
+        ("-conf {}/bare.py", "bare.py cannot be read: KeyError.*Expected YAML of settings by task, or Python"),
         ("-conf {}/broken.py", "broken.py cannot be read: SyntaxError"),
     ],
 )
@@ -487,7 +487,7 @@ def test_settings_that_do_not_fit_are_said_and_leave_no_folder(words: str, messa
     (tmp_path / "bare.py").write_text("settings = {}")
     (tmp_path / "broken.py").write_text("hyperparams = {")
     logs = tmp_path / "logs"
-    with pytest.raises(SystemExit, match=f"(?i)sb3-said train: error: .*{message}"):
+    with pytest.raises(SystemExit, match=f"sb3-said train: error: .*{message}"):
         train.main(
             ["--env", "Pendulum-v1", "-f", str(logs), "--verbose", "0", *words.replace("{}", str(tmp_path)).split()]
         )
